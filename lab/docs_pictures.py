@@ -22,7 +22,7 @@ from torch import Tensor
 import pointsplat_ns as ps
 from lab.common.printing import save_figure, start
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.sampling import Sampler
 
 SHOWN = 0
 """Index of the sampled view that most pictures show."""
@@ -131,7 +131,7 @@ def budgets(path: Path) -> None:
 
 def sampled(path: Path) -> None:
     """Where the twelve views stand, from above, and what they show."""
-    up = estimated_up(room()).direction
+    up = Sampler(room()).up.direction
     right = torch.linalg.cross(up, torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64))
     right = right / right.norm()
     plan = torch.stack([right, torch.linalg.cross(up, right)], 1)  # [3, 2]

@@ -26,6 +26,7 @@ from lab.common.ways import count_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io import read_scene
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.merging import MERGING, merge
 from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
@@ -57,7 +58,7 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
         "choice of groups": lambda compiled: best_groups(members, group, groups, compiled=compiled),
     }
     whole = participants.in_units(scene)
-    if viewpoints := sampled_viewpoints(whole, 1920, 1080, MERGING):
+    if viewpoints := sampled_viewpoints(Sampler(whole), MERGING):
         view = viewpoints.views.resized(MERGING.visibility_side)[0]
         parts["visible pixels, a view"] = lambda compiled: pixels_of(whole, view, compiled)
     return parts

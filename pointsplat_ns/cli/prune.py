@@ -125,7 +125,7 @@ def prune(
         if dry_run or plot is not None:
             raise SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
         with fixed_threads(threads):
-            _prune_in_parts(rows, output, request, memory, poses, resolution, json_output)
+            _prune_in_parts(rows, output, request, memory, poses, resolution, up, json_output)
         return
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
@@ -154,17 +154,19 @@ def _prune_in_parts(
     memory: float | None,
     poses: Path | None,
     resolution: str | None,
+    up: str | None,
     json_output: bool,
 ) -> None:
     """Prune a scene that does not fit into memory, and print the result."""
     from pointsplat_ns.compression.prune_file import prune_file
     from pointsplat_ns.io.ply import PlyRows
     from pointsplat_ns.looking.sizes import parse_resolution
+    from pointsplat_ns.looking.upright import up_named
     from pointsplat_ns.system.progress import progress_bar
 
     size, limit = parse_resolution(resolution), None if memory is None else 1e6 * memory
     with progress_bar() as report:
-        before, seconds = prune_file(rows, output, request, limit, poses, size, report)
+        before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report)
     small = PlyRows.open(output)
     assert small is not None
     if json_output:

@@ -36,7 +36,7 @@ from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rasterizer import render
@@ -301,8 +301,7 @@ def make_levels(
     made: list[Level] = []
     before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before
     start = time.perf_counter()
-    known = views.known(VIEW_COUNTS.weighed)
-    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), known, views.resolution):
+    for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
         parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
         errors = None

@@ -14,7 +14,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.turning import turned
-from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import axis_named
 
 
@@ -75,7 +75,7 @@ def place(
         scene = _frame_at(original_frame).inverse().apply(scene)
     if directions is not None:
         now, wanted = directions
-        matrix = _turn(estimated_up(scene).direction if now is None else now, wanted)
+        matrix = _turn(Sampler(scene).up.direction if now is None else now, wanted)
         scene = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
     if scale != 1.0:
         scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)

@@ -19,6 +19,7 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import (
     Megabytes,
@@ -81,7 +82,7 @@ def prune_scene(
     report = functools.partial(progress, f"by {request.by}")
     if count is not None:
         method_views, weight = _views_of_method(request, views), request.opacity_weight
-        scene = prune(start, count, request.by, method_views, weight, report, rendered.append, views.resolution)
+        scene = prune(start, count, request.by, method_views, weight, report, rendered.append)
     else:
         make = _pruner(start, request, views, report, rendered)
         if cleaning is not None:
@@ -127,11 +128,11 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, n
     return cut_sh(dense, degree)
 
 
-def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Callable[[], Views] | None:
-    """The views that a method needs. Merging gets known views only, because it samples its own."""
+def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Sampler | Callable[[], Views] | None:
+    """The views that a method needs: known ones for merging, or the sampler of the scene."""
     if request.method.needs_views:
         return functools.partial(views.scored, VIEW_COUNTS.scored)
-    return views.known(VIEW_COUNTS.weighed) if request.method.score is None else None
+    return views.for_merging() if request.method.score is None else None
 
 
 def _pruner(
@@ -145,7 +146,7 @@ def _pruner(
     are computed once. The views that merging rendered are added to ``rendered``."""
     method = request.method
     if method.score is None:
-        merger = Merger(scene, views.known(VIEW_COUNTS.weighed), views.resolution)
+        merger = Merger(scene, views.for_merging())
 
         def made(count: int) -> Gaussians:
             merged = merger.merged(count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import time
 from dataclasses import dataclass, replace
@@ -16,7 +17,9 @@ from pointsplat_ns.io.formats import format_to_read
 from pointsplat_ns.io.formats.compressed_ply import is_compressed
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
@@ -97,6 +100,7 @@ def prune_file(
     memory: float | None = None,
     poses: Path | None = None,
     resolution: tuple[int, int] | None = None,
+    up: Up | None = None,
     progress: Progress = silent,
 ) -> tuple[int, float]:
     """Merge a PLY cell by cell. A call that was killed goes on where it was, from a hidden folder beside the output.
@@ -108,6 +112,7 @@ def prune_file(
         memory: bytes that may be taken; more than the largest cell takes change nothing.
         poses: a file of cameras; by default views are sampled.
         resolution: width and height of views, pixels.
+        up: which way is up, for sampled views; by default it is estimated.
         progress: called with what is being done, and the share done of it.
 
     Returns:
@@ -135,7 +140,7 @@ def prune_file(
     work = {
         "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
         "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
-        "settings": repr(MERGING),
+        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING),
     }  # fmt: skip
 
     def views(sample: Gaussians) -> Views | None:
@@ -151,7 +156,8 @@ def prune_file(
 
     count_of(rows.count)  # errors before the work
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, rows.count * (_row_bytes(rows) + 350))
-    before, _ = merge_file(rows, count_of, output, most, scratch, views, resolution or RESOLUTION, progress)
+    sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
+    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress)
     scratch.remove()
     return before, time.perf_counter() - start
 

@@ -15,10 +15,10 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, views_in_units
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
-from pointsplat_ns.looking.sampling import content_surface, views_in_scene_units, which_way_up
+from pointsplat_ns.looking.sampling import Sampler, views_in_scene_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
-from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
+from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.upright import Up, UprightBox, level_directions
 from pointsplat_ns.looking.whole import around, few_in_units, shown, whole_views
 from pointsplat_ns.views import Views
@@ -63,11 +63,9 @@ def opening_views(
     Raises:
         DataError: if nothing of the scene is visible.
     """
-    centre, diagonal, surface = content_surface(scene, settings)
-    photos = photo_places(scene, settings) if known is None else None
-    photos = None if photos is None else photos.in_units(centre, diagonal)
-    up, room = which_way_up(scene, centre, diagonal, surface, photos, up)
-    box = UprightBox.of(surface, up.direction)
+    sampler = Sampler(scene, (width, height), up, settings)
+    centre, diagonal = sampler.content
+    surface, box = sampler.surface, sampler.box
     if known is not None:
         width, height = known.width, known.height
     few = few_in_units(scene, settings.pictured_count, centre, diagonal)
@@ -75,17 +73,17 @@ def opening_views(
     outside = whole_views(surface, box.up, turns, settings.opening_elevation, width, height)
     of_outside = shown(few, outside, settings.pictured_side)
     if known is None:
-        inside = _inside(surface, box, photos, width, height)
+        inside = _inside(surface, box, sampler.photos_in_units, width, height)
     else:
         inside = views_in_units(known, centre, diagonal)
     of_inside = shown(few, inside, settings.pictured_side)
     most_outside, most_inside = (int(rows.sum(1).max()) if len(rows) else 0 for rows in (of_outside, of_inside))
     ratio = most_inside / max(most_outside, 1)
-    whole = most_inside == 0 or not (room or ratio > settings.opening_inside)
+    whole = most_inside == 0 or not (sampler.inside or ratio > settings.opening_inside)
     if not whole:
         taken = _completing(of_inside, count)
         if known is not None:
-            return Opening(known[taken], up, False)
+            return Opening(known[taken], sampler.up, False)
         chosen = inside[taken].viewmats
     elif known is not None or ratio > settings.opening_beside:
         first = int(of_outside.sum(1).argmax())
@@ -99,7 +97,7 @@ def opening_views(
         Ks = torch.cat([views.Ks[:1], known.Ks[others].to(views.Ks)])
         viewmats = torch.cat([views.viewmats[:1], known.viewmats[others].to(views.viewmats)])
         views = replace(known, viewmats=viewmats, Ks=Ks)
-    return Opening(views, up, whole)
+    return Opening(views, sampler.up, whole)
 
 
 def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width: int, height: int) -> Views:

@@ -6,6 +6,7 @@ All is in units of the content (its diagonal is 10), so that the scene's own uni
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_u
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.search import ViewSearch
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, pointing_up, upright_axis
@@ -70,61 +72,114 @@ def sample_views(
         >>> len(views), tuple(views.viewmats.shape), (views.width, views.height)
         (3, (3, 4, 4), (64, 48))
     """
-    return views_about(scene, photo_places(scene, settings), count, width, height, seed, up, settings=settings)
+    return Sampler(scene, (width, height), None if up is None else Up(unit_direction(up)), settings).views(count, seed)
 
 
-@torch.no_grad()
-def views_about(
-    scene: Gaussians,
-    photos: PhotoPlaces | None,
-    count: int,
-    width: int = 320,
-    height: int = 240,
-    seed: int = 0,
-    up: Tensor | None = None,
-    sharp: bool = True,
-    settings: LookingSettings = LOOKING,
-) -> Views:
-    """Sample views as :func:`sample_views` does, near photo places that are known already.
+class Sampler:
+    """Samples views of a scene as :func:`sample_views` does. What all views have in common is found once.
 
     Args:
-        photos: the scene's :func:`~pointsplat_ns.looking.traces.photo_places`.
-        sharp: whether blurred views are refused, which a few large Gaussians fill, because nobody takes such photos.
-            Renders are then compared where they matter; without the rule, views stand in more places.
+        scene: N Gaussians.
+        resolution: width and height of the views, pixels.
+        up: which way is up; by default it is estimated.
+        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
+
+    Raises:
+        DataError: if the resolution is not positive.
     """
-    if count < 1:
-        raise DataError(f"{count} views asked for; expected at least 1")
-    if min(width, height) < 1:
-        raise DataError(f"views of {width} x {height} pixels asked for; expected at least 1 x 1")
-    up = None if up is None else unit_direction(up)
-    centre, diagonal, surface = content_surface(scene, settings)
-    photos = None if photos is None else photos.in_units(centre, diagonal)
-    known = None if up is None else Up(up)
-    upright, inside = which_way_up(scene, centre, diagonal, surface, photos, known)
-    box = UprightBox.of(surface, upright.direction)
-    fine, widths = None, None
-    if sharp:
-        fine = in_units(thinned(scene, settings.blur_count), centre, diagonal)
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        resolution: tuple[int, int] = RESOLUTION,
+        up: Up | None = None,
+        settings: LookingSettings = LOOKING,
+    ):
+        if min(resolution) < 1:
+            raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
+        self.scene, self.resolution, self.settings, self._up = scene.detach(), resolution, settings, up
+
+    @cached_property
+    def photos(self) -> PhotoPlaces | None:
+        """Where the scene's photos were taken, scene units; None if it does not tell."""
+        return photo_places(self.scene, self.settings)
+
+    @cached_property
+    def content(self) -> tuple[Tensor, float]:
+        """Centre (3,) and diagonal of the content, scene units."""
+        return content_size(self.scene, content_box(self.scene, self.settings))
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The surface of the content, in its units. Raises DataError if nothing is visible."""
+        return Surface.of(self.scene, *self.content, self.settings)
+
+    @cached_property
+    def photos_in_units(self) -> PhotoPlaces | None:
+        """:attr:`photos` in units of the content."""
+        return None if self.photos is None else self.photos.in_units(*self.content)
+
+    @cached_property
+    def up(self) -> Up:
+        """Which way is up. Raises DataError if it has to be estimated, and nothing of the scene is visible."""
+        if self._up is not None:
+            return self._up
+        axis = upright_axis(self.surface, self.photos_in_units)
+        return pointing_up(self.surface, axis, seen_from_above(self.scene, *self.content, self.surface, axis))
+
+    @cached_property
+    def box(self) -> UprightBox:
+        """The upright box around the surface."""
+        return UprightBox.of(self.surface, self.up.direction)
+
+    @cached_property
+    def inside(self) -> bool:
+        """Whether the scene is one to look at from inside."""
+        return is_room(self.surface, self.box)
+
+    @cached_property
+    def _fine(self) -> tuple[Gaussians, Tensor]:
+        """Some of the Gaussians, enlarged, in units of the content, and their widths (n,) before they were enlarged."""
+        count = self.settings.blur_count
+        fine = in_units(thinned(self.scene, count), *self.content)
         widths = log_widths(fine.scales).nan_to_num(-100.0).exp()
-        widths = widths / math.sqrt(max(1, len(scene) // settings.blur_count))  # before it was enlarged
-    generator = torch.Generator().manual_seed(seed)
+        return fine, widths / math.sqrt(max(1, len(self.scene) // count))
 
-    def found(inside: bool, photos: PhotoPlaces | None, count: int) -> Tensor:
-        search = ViewSearch(fine, widths, surface, box, inside, width, height, generator, photos, settings)
-        return search.views(count)
+    @torch.no_grad()
+    def views(self, count: int, seed: int = 0, sharp: bool = True, about_photos: bool = True) -> Views:
+        """``count`` views on the CPU, fewer if the search finds fewer.
 
-    near_photos = torch.empty(0, 4, 4, dtype=torch.float64)
-    if photos is not None:
-        near_photos = found(inside, photos, int(settings.photo_share * count))
-    others = found(inside, None, count - len(near_photos))
-    if len(near_photos) + len(others) == 0:
-        others = found(not inside, None, count)
-    taken = _alternating(near_photos, others)
-    if len(taken) == 0:
-        raise DataError(
-            "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
-        )
-    return views_in_scene_units(taken, width, height, centre, diagonal, settings)
+        Args:
+            count, seed: as for :func:`sample_views`.
+            sharp: whether blurred views are refused, which a few large Gaussians fill, because nobody takes such
+                photos. Renders are then compared where they matter; without the rule, views stand in more places.
+            about_photos: whether half of the views stand near places of photos, if the scene tells them.
+
+        Raises:
+            DataError: as :func:`sample_views`.
+        """
+        if count < 1:
+            raise DataError(f"{count} views asked for; expected at least 1")
+        generator = torch.Generator().manual_seed(seed)
+        fine, widths = self._fine if sharp else (None, None)
+
+        def found(inside: bool, photos: PhotoPlaces | None, count: int) -> Tensor:
+            pictures = (inside, *self.resolution)
+            search = ViewSearch(fine, widths, self.surface, self.box, *pictures, generator, photos, self.settings)
+            return search.views(count)
+
+        near_photos = torch.empty(0, 4, 4, dtype=torch.float64)
+        if about_photos and self.photos_in_units is not None:
+            near_photos = found(self.inside, self.photos_in_units, int(self.settings.photo_share * count))
+        others = found(self.inside, None, count - len(near_photos))
+        if len(near_photos) + len(others) == 0:
+            others = found(not self.inside, None, count)
+        taken = _alternating(near_photos, others)
+        if len(taken) == 0:
+            raise DataError(
+                "no free place to look at the scene from was found; give a run whose data is at hand, which has poses"
+            )
+        return views_in_scene_units(taken, *self.resolution, *self.content, self.settings)
 
 
 def unit_direction(up: Tensor) -> Tensor:
@@ -153,46 +208,6 @@ def _alternating(first: Tensor, second: Tensor) -> Tensor:
     """Matrices (n, 4, 4) and (m, 4, 4), evenly mixed, (n + m, 4, 4): a few of them contain both kinds."""
     ranks = torch.cat([(torch.arange(len(some)) + 0.5) / max(1, len(some)) for some in (first, second)])
     return torch.cat([first, second])[ranks.argsort(stable=True)]
-
-
-@torch.no_grad()
-def estimated_up(scene: Gaussians, settings: LookingSettings = LOOKING) -> Up:
-    """The direction that is up in a scene, as :func:`sample_views` takes it.
-
-    Raises:
-        DataError: if nothing of the scene is visible.
-    """
-    return up_about(scene, photo_places(scene, settings), settings)
-
-
-@torch.no_grad()
-def up_about(scene: Gaussians, photos: PhotoPlaces | None, settings: LookingSettings = LOOKING) -> Up:
-    """:func:`estimated_up` of a scene whose photo places are known already."""
-    centre, diagonal, surface = content_surface(scene, settings)
-    photos = None if photos is None else photos.in_units(centre, diagonal)
-    return which_way_up(scene, centre, diagonal, surface, photos)[0]
-
-
-def content_surface(scene: Gaussians, settings: LookingSettings) -> tuple[Tensor, float, Surface]:
-    """Centre (3,) and diagonal of the content, scene units, and its surface."""
-    centre, diagonal = content_size(scene, content_box(scene, settings))
-    return centre, diagonal, Surface.of(scene, centre, diagonal, settings)
-
-
-def which_way_up(
-    scene: Gaussians,
-    centre: Tensor,
-    diagonal: float,
-    surface: Surface,
-    photos: PhotoPlaces | None,
-    up: Up | None = None,
-) -> tuple[Up, bool]:
-    """Which way is up, unless it is known, and whether the scene is a room."""
-    axis = upright_axis(surface, photos) if up is None else up.direction
-    inside = is_room(surface, UprightBox.of(surface, axis))
-    if up is not None:
-        return up, inside
-    return pointing_up(surface, axis, seen_from_above(scene, centre, diagonal, surface, axis)), inside
 
 
 def is_room(surface: Surface, box: UprightBox) -> bool:

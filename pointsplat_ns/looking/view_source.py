@@ -13,10 +13,9 @@ from pathlib import Path
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
-from pointsplat_ns.looking.sampling import up_about, views_about
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
-from pointsplat_ns.looking.traces import PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.views import View, Views, spread_indices
 
@@ -116,29 +115,28 @@ class ViewSource:
             self.origin = "poses of the dataset"
             return self._at_resolution(self._of_dataset.spread(count))
         views = self._sampled(count, 0)
-        where = "in free space" if self._photos is None else "in free space, half of them where photos were taken"
+        where = (
+            "in free space" if self.sampler.photos is None else "in free space, half of them where photos were taken"
+        )
         self.origin = f"poses sampled {where}, up is {self.up}{self.missing}"
         return views
 
     def _sampled(self, count: int, seed: int) -> Views:
-        width, height = self.resolution
-        return views_about(
-            self._scene, self._photos, count, width=width, height=height, seed=seed, up=self.up.direction,
-            settings=self._settings,
-        )  # fmt: skip
+        return self.sampler.views(count, seed)
 
     @cached_property
-    def _photos(self) -> PhotoPlaces | None:
-        return photo_places(self._scene, self._settings)
+    def sampler(self) -> Sampler:
+        """The sampler of the scene."""
+        return Sampler(self._scene, self.resolution, self._up, self._settings)
 
-    @cached_property
+    @property
     def up(self) -> Up:
         """Which way is up in the scene.
 
         Raises:
             DataError: if it has to be estimated, and nothing of the scene is visible.
         """
-        return self._up or up_about(self._scene, self._photos, self._settings)
+        return self.sampler.up
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
@@ -146,6 +144,10 @@ class ViewSource:
         if self.given is None and self._of_dataset is None:
             return None
         return self.views(count)
+
+    def for_merging(self) -> Views | Sampler:
+        """At most :data:`VIEW_COUNTS.weighed` known views; the sampler if there are none."""
+        return self.known(VIEW_COUNTS.weighed) or self.sampler
 
     def _at_resolution(self, views: Views) -> Views:
         """Views with the longer side of the resolution, if one was asked for."""

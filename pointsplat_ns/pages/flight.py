@@ -19,7 +19,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.opening import opening_views
-from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable, ply_bytes
@@ -51,7 +51,7 @@ class FlightFrame:
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
         if up is None and known is not None:
-            up = _up_of(known, estimated_up(scene))
+            up = _up_of(known, Sampler(scene).up)
         opening = opening_views(scene.detach(), 6, up=up, known=known)
         centre, size = content_size(scene)
         return FlightFrame(centre, size, opening.up, views_in_units(opening.views, centre, size), opening.whole)

@@ -12,7 +12,7 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.looking.sizes import RESOLUTION
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.merging import merge
@@ -113,11 +113,10 @@ def prune(
     scene: Gaussians,
     keep: Keep | str,
     by: str = "merge",
-    views: Views | Callable[[], Views] | None = None,
+    views: Views | Sampler | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
     views_used: Callable[[Views], None] | None = None,
-    resolution: tuple[int, int] = RESOLUTION,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
 
@@ -125,12 +124,11 @@ def prune(
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them, or a function that returns them. Merging uses views that are given as
-            such; for a function or None it samples views of its own.
+        views: views for methods that need them, or a function that returns them. Merging uses views or a sampler; for
+            a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        views_used: called with the views that merging rendered, given or sampled; not called if it rendered none.
-        resolution: width and height of the views that merging samples, pixels.
+        views_used: called with the views that merging sampled or was given, if it rendered.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.
@@ -146,8 +144,7 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.antialiased)
     need_usable(scene)
     if method.score is None:
-        given = views if isinstance(views, Views) else None
-        merged = merge(scene, count, progress=progress, views=given, resolution=resolution)
+        merged = merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None)
         logger.debug("%s", merged.finish.note)
         if views_used is not None and merged.views is not None:
             views_used(merged.views)
@@ -159,7 +156,7 @@ def prune(
 def score_of(
     scene: Gaussians,
     method: Method,
-    views: Views | Callable[[], Views] | None = None,
+    views: Views | Sampler | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:

@@ -13,7 +13,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import resolve_keep, select
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.merging import Merger
@@ -106,7 +106,7 @@ class Selection:
 
     @cached_property
     def _merger(self) -> Merger:
-        return Merger(self.scene, self._source.known(VIEW_COUNTS.weighed))
+        return Merger(self.scene, self._source.for_merging())
 
     def _work(self) -> None:
         while True:

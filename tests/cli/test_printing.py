@@ -87,7 +87,7 @@ def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_
         **json.loads(Path("room_lod/lod.json").read_text("utf-8")),
     }
     views = sample_views(box_room(0, COUNT), 2, 24, 18)
-    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     few = ("--views", "2", "--repairs", "none", "--points", "2")

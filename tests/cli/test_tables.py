@@ -24,7 +24,7 @@ def views() -> ps.Views:
 @pytest.fixture()
 def ply(tmp_path, views, no_lpips, monkeypatch) -> Path:
     """A room of 400 Gaussians, looked at from three views."""
-    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"

@@ -29,7 +29,7 @@ def views():
 def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
     """A room of 400 Gaussians, looked at from three views; repairs take two steps, plots are none, and
     times are as counts are."""
-    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))

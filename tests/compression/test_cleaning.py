@@ -200,9 +200,7 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
     def nowhere(*_, **options):
         raise DataError("no free place to look from was found")
 
-    monkeypatch.setattr("pointsplat_ns.pruning.merging.visibility.views_about", nowhere)
-    monkeypatch.setattr("pointsplat_ns.compression.cleaning.sample_views", nowhere)
-    monkeypatch.setattr("pointsplat_ns.looking.view_source.views_about", nowhere)
+    monkeypatch.setattr("pointsplat_ns.looking.sampling.Sampler.views", nowhere)
     scene = with_junk(box_room(0, 40, size=0.05))
     junk = find_junk(scene)
     assert junk.places == 0 and len(junk.unseen) == 0

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from making import ball, same
+from making import ball, box_room, same
 from pointsplat_ns.compression.pictures import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
@@ -15,6 +15,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, Keep, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
 from pointsplat_ns.system.progress import silent
@@ -168,3 +169,12 @@ def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
 def test_merging_looks_from_the_views_that_are_given_and_from_no_others(scene, views):
     given = pruned(scene, views, 30).scene
     assert same(given, prune(scene, 30, views=views)) and not same(given, prune(scene, 30))
+
+
+def test_merging_stands_upright_in_views_that_are_sampled_for_it():
+    scene = box_room(0, 3000)
+    source = ViewSource(scene, resolution=(64, 48), up=up_named("x"))
+    looked = pruned(scene, source, 300).views
+    assert looked is not None and (looked.width, looked.height) == (64, 48)
+    level = looked.viewmats[:, 0, :3] @ source.up.direction  # no camera is rolled about its axis
+    assert float(level.abs().max()) < 1e-6

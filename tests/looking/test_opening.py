@@ -11,7 +11,7 @@ from upright_scenes import TURNS, plates, room, turned
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
-from pointsplat_ns.looking.sampling import estimated_up
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.upright import Up
 
@@ -59,10 +59,10 @@ def test_up_is_the_side_from_which_more_is_seen(axis):
     """Also where -y is usual."""
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
     scene = turned(corner(), turn)
-    assert estimated_up(scene).direction.tolist() == list(map(float, axis))
+    assert Sampler(scene).up.direction.tolist() == list(map(float, axis))
     without = replace(LOOKING, min_seen_from_above=math.inf)
     if axis == (0, 1, 0):
-        assert estimated_up(scene, without).direction.tolist() == [0.0, -1.0, 0.0]
+        assert Sampler(scene, settings=without).up.direction.tolist() == [0.0, -1.0, 0.0]
 
 
 def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():

@@ -12,8 +12,9 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.looking.sampling import sample_views, views_about
+from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.rasterizer import pixels_of, render, render_depth
 
 
@@ -185,5 +186,7 @@ def test_views_near_photo_places_can_be_turned_off(off):
     """Not the estimate of up, which uses photo places as well: it is given."""
     scene, up = photographed(), torch.tensor([0.0, 0.0, 1.0])
     without = sample_views(scene, 3, 64, 48, up=up, settings=dataclasses.replace(LOOKING, **off))
-    assert torch.equal(without.viewmats, views_about(scene, None, 3, 64, 48, up=up).viewmats)
+    assert torch.equal(
+        without.viewmats, Sampler(scene, (64, 48), Up(up.double())).views(3, about_photos=False).viewmats
+    )
     assert not torch.equal(without.viewmats, sample_views(scene, 3, 64, 48, up=up).viewmats)

@@ -9,7 +9,6 @@ import torch
 from making import ball, box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import sides_of
 from pointsplat_ns.looking.traces import PhotoPlaces
@@ -108,7 +107,9 @@ def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are
 def test_sampled_poses_near_photo_places_say_so(monkeypatch):
     asked = []
     photos = PhotoPlaces(torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1))
-    monkeypatch.setattr(view_source, "photo_places", lambda scene, settings: asked.append(scene) or photos)
+    monkeypatch.setattr(
+        "pointsplat_ns.looking.sampling.photo_places", lambda scene, settings: asked.append(scene) or photos
+    )
     source = ViewSource(box_room(0))
     assert len(source.views(3)) and len(source.compared())
     assert source.origin.startswith("poses sampled in free space, half of them where photos were taken, up is ")

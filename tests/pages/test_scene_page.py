@@ -163,8 +163,7 @@ def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
 def test_page_says_where_up_is_a_guess_and_how_to_turn_the_scene(up, rolled, sure, tmp_path, monkeypatch):
     """Cameras that people held are not exactly level, and tell what is up."""
     guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
-    monkeypatch.setattr("pointsplat_ns.looking.opening.which_way_up", lambda *given: (given[-1] or guess, False))
-    monkeypatch.setattr("pointsplat_ns.pages.flight.estimated_up", lambda scene: guess)
+    monkeypatch.setattr("pointsplat_ns.looking.sampling.pointing_up", lambda *_: guess)
     views = None
     if rolled is not None:
         views = ball_seen_from([[3.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])

@@ -53,7 +53,7 @@ def room_views() -> ps.Views:
 def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
     none. Tests wait neither for one another nor for anything else on this machine."""
-    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, *_, **options: room_views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)

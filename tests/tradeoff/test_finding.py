@@ -13,18 +13,19 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.tradeoff import judging, settings
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.measuring import Measurer
 from pointsplat_ns.tradeoff.targets import Targets
 
+SAMPLED = view_source.Sampler.views
+
 
 @pytest.fixture(autouse=True)
 def quick(room_views, no_lpips, monkeypatch):
     """Three small views of any scene, no repairs, which take long, and times as counts are."""
-    monkeypatch.setattr(view_source, "views_about", lambda scene, photos, count, **options: room_views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
     for module in (settings, folders):
         monkeypatch.setattr(module, "repairs_of", lambda effort: ("none",))
     monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
@@ -74,10 +75,9 @@ def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, plain_pl
 def test_scenes_are_judged_in_the_views_that_compact_compares_in(
     room, tmp_path, plain_page, plain_plots, monkeypatch, resolution, search
 ):
-    def few(scene, photos, count, width, height, **seed):
-        return sample_views(scene, min(count, 3), width, height)
-
-    monkeypatch.setattr(view_source, "views_about", few)
+    monkeypatch.setattr(
+        view_source.Sampler, "views", lambda sampler, count, *_, **options: SAMPLED(sampler, min(count, 3))
+    )
     monkeypatch.setattr(view_source, "RESOLUTION", (512, 384))  # which decisions are made at, if nothing is asked for
     wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
     judged, begin = [], judging.Judge.__init__

@@ -29,7 +29,7 @@ SETTINGS = [
 def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, tmp_path, monkeypatch):
     """With a scene whose path has a space, and few and small views."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
-    monkeypatch.setattr(view_source, "views_about", lambda *args, **options: room_views)
+    monkeypatch.setattr(view_source.Sampler, "views", lambda *args, **options: room_views)
     monkeypatch.chdir(tmp_path)
     path = Path("the room.ply")
     dense = ps.load(room)

@@ -191,7 +191,7 @@ def test_up_that_is_a_guess_is_called_one(browser):
     guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
     for up, words in ((None, True), ("z", False)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("pointsplat_ns.looking.view_source.up_about", lambda *_: guess)
+            patch.setattr("pointsplat_ns.looking.sampling.pointing_up", lambda *_: guess)
             with ps.open_viewer(ps.example_room()[::20], port=0, up=up) as viewer:
                 browser.get(viewer.url)
                 assert ("Which way is up is a guess." in text_of(browser)) is words

@@ -11,8 +11,9 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
-from pointsplat_ns.looking.content import content_size, in_units
+from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
+from pointsplat_ns.views import Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,10 @@ class Participants:
     def in_units(self, scene: Gaussians) -> Gaussians:
         """A scene in the units of this scene's content, see :func:`~pointsplat_ns.looking.content.in_units`."""
         return in_units(scene, self.centre, self.size)
+
+    def views_in_units(self, views: Views) -> Views:
+        """Views of this scene in the same units."""
+        return views_in_units(views, self.centre, self.size)
 
 
 def drawable(scene: Gaussians, k: int) -> Tensor:

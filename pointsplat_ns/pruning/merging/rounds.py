@@ -19,9 +19,8 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
-from pointsplat_ns.looking.content import thinned, views_in_units
-from pointsplat_ns.looking.sampling import views_in_scene_units
-from pointsplat_ns.looking.sizes import RESOLUTION, RendersOfSizes, sides_of
+from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
 from pointsplat_ns.pruning.merging.groups import Groups, merged_groups
@@ -56,8 +55,7 @@ def merge(
     scene: Gaussians,
     k: int,
     progress: Callable[[float], None] | None = None,
-    views: Views | None = None,
-    resolution: tuple[int, int] = RESOLUTION,
+    views: Views | Sampler | None = None,
     settings: MergeSettings = MERGING,
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
@@ -71,9 +69,8 @@ def merge(
         k: number of Gaussians in the result; N returns the scene itself.
         progress: called with the share done, in [0, 1].
         views: views in which the result should look the same, such as the poses of the scene's photos. What none of
-            them shows is merged first. By default views are sampled from where photos were taken if the
-            scene tells (:mod:`~pointsplat_ns.looking.traces`), else from free places in it, in all directions.
-        resolution: width and height of sampled views, pixels.
+            them shows is merged first. A sampler of the same scene, or of one that looks the same, samples them; by
+            default a new one does.
         settings: the tuned numbers.
 
     Returns:
@@ -82,15 +79,14 @@ def merge(
     Raises:
         BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
     """
-    return next(merge_levels(scene, [k], progress, views, resolution, settings))
+    return next(merge_levels(scene, [k], progress, views, settings))
 
 
 def merge_levels(
     scene: Gaussians,
     counts: Sequence[int],
     progress: Callable[[float], None] | None = None,
-    views: Views | None = None,
-    resolution: tuple[int, int] = RESOLUTION,
+    views: Views | Sampler | None = None,
     settings: MergeSettings = MERGING,
 ) -> Iterator[Merged]:
     """Replace a scene by fewer and fewer Gaussians in one pass.
@@ -102,7 +98,7 @@ def merge_levels(
         scene: N Gaussians, see :func:`merge`.
         counts: number of Gaussians of each level, in 1..N, descending without repetition.
         progress: called with the share done of all levels, in [0, 1].
-        views, resolution, settings: as for :func:`merge`.
+        views, settings: as for :func:`merge`.
 
     Yields:
         A level for each count, as soon as it is reached.
@@ -116,7 +112,7 @@ def merge_levels(
             raise BudgetError(f"cannot merge {n} Gaussians into {k}; expected 1 to {n}")
     if any(fewer >= more for more, fewer in itertools.pairwise(counts)):
         raise BudgetError(f"levels of {', '.join(map(str, counts))} Gaussians; expected descending counts")
-    return _levels(scene, counts, progress or (lambda share: None), views, resolution, settings)
+    return _levels(scene, counts, progress or (lambda share: None), views, settings)
 
 
 class Merger:
@@ -126,23 +122,22 @@ class Merger:
     The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
 
     Args:
-        scene, views, resolution, settings: as for :func:`merge`.
+        scene, views, settings: as for :func:`merge`.
     """
 
     def __init__(
         self,
         scene: Gaussians,
-        views: Views | None = None,
-        resolution: tuple[int, int] = RESOLUTION,
+        views: Views | Sampler | None = None,
         settings: MergeSettings = MERGING,
     ):
-        self._scene, self._options = scene, (views, resolution, settings)
+        self._scene, self._options = scene, (views, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
         """The result of :func:`merge`, to the bit. Arguments and errors as there."""
-        views, _, settings = self._options
+        settings = self._options[-1]
         if not self._steps and 1 <= k < len(self._scene):
             dense = self._scene.to(device="cpu")
             with one_thread_each():
@@ -159,7 +154,7 @@ class Merger:
                 step = one_round(step, k, settings)
             self._steps += [step] if shared else []
             report(0.95 * (first - len(step.state)) / max(first - k, 1))
-        merged = _result(step, self._scene.device, views, True, settings)
+        merged = _result(step, self._scene.device, True, settings)
         report(1.0)
         return merged
 
@@ -169,8 +164,7 @@ def _levels(
     scene: Gaussians,
     counts: Sequence[int],
     report: Callable[[float], None],
-    views: Views | None,
-    resolution: tuple[int, int],
+    views: Views | Sampler | None,
     settings: MergeSettings,
 ) -> Iterator[Merged]:
     n = len(scene)
@@ -189,25 +183,25 @@ def _levels(
         left = max(k, copies.distinct)
         if step is None or left < len(step.reduced.members):
             with one_thread_each():
-                step = first_step(copies.reduced(left), views, resolution, settings)
+                step = first_step(copies.reduced(left), views, settings)
         while len(step.state) > k:
             with one_thread_each():
                 step = one_round(step, k, settings)
             report(0.95 * (first - len(step.state)) / max(first - last, 1))
-        merged = _result(step, scene.device, views, len(counts) == 1, settings)
+        merged = _result(step, scene.device, len(counts) == 1, settings)
         if k == last:
             report(1.0)
         yield merged
 
 
-def _result(step: Step, device: torch.device, views: Views | None, regroup: bool, settings: MergeSettings) -> Merged:
-    """The result after the last round, on a device; ``views`` are those that were given."""
+def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
+    """The result after the last round, on a device."""
     with one_thread_each():
         groups, scene, finish = finished(step, regroup, settings)
     of_reduced = torch.full((len(step.reduced.scene),), -1)
     of_reduced[step.participants.members] = groups.group
     assignment = of_reduced[step.reduced.index]
-    return Merged(scene.to(device), assignment.to(device), finish, views or _views_of(step))
+    return Merged(scene.to(device), assignment.to(device), finish, step.viewpoints.views if step.viewpoints else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,32 +217,23 @@ class Step:
     """Renders of the scene, or of what remained once it was few enough to render."""
 
 
-def _views_of(step: Step) -> Views | None:
-    """The views that were sampled, in the scene's own units; None if there are none."""
-    if step.viewpoints is None:
-        return None
-    sampled, whole = step.viewpoints.views, step.participants
-    return views_in_scene_units(sampled.viewmats, sampled.width, sampled.height, whole.centre, whole.size)
-
-
 def looked_at(
-    participants: Participants, views: Views | None, resolution: tuple[int, int], settings: MergeSettings
+    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
 ) -> tuple[Viewpoints | None, Tensor]:
     """The viewpoints, None for a small scene without known views, and the visibility weights (n,) of participants;
-    ``views`` and ``resolution`` as for :func:`merge`."""
+    ``views`` as for :func:`merge`."""
     viewpoints: Viewpoints | None = None
-    if views is not None:
-        viewpoints = Viewpoints(views_in_units(views, participants.centre, participants.size))
+    if isinstance(views, Views):
+        viewpoints = Viewpoints(views)
     elif len(participants) >= settings.min_count_rendered:
-        few = thinned(participants.scene, settings.max_count_drawn)
-        viewpoints = sampled_viewpoints(participants.in_units(few), *resolution, settings)
+        viewpoints = sampled_viewpoints(views or Sampler(participants.scene), settings)
     return viewpoints, visibility_weights(participants, viewpoints, settings)
 
 
-def first_step(reduced: Reduced, views: Views | None, resolution: tuple[int, int], settings: MergeSettings) -> Step:
-    """The step before the first round; ``views`` and ``resolution`` as for :func:`merge`."""
+def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeSettings) -> Step:
+    """The step before the first round; ``views`` as for :func:`merge`."""
     participants = Participants.of(reduced.scene, reduced.members)
-    viewpoints, weights = looked_at(participants, views, resolution, settings)
+    viewpoints, weights = looked_at(participants, views, settings)
     state = initial_state(participants, weights, settings)
     tree = Tree.of_single(len(participants))
 
@@ -314,6 +299,6 @@ def _reference(
     the middle size; None if they are too many or there are no viewpoints."""
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
-    views = viewpoints.views.spread(settings.finish_views)
+    views = participants.views_in_units(viewpoints.views.spread(settings.finish_views))
     sides = sides_of(views.width, views.height)
     return RendersOfSizes(participants.in_units(dense()), views, [sides[len(sides) // 2]])

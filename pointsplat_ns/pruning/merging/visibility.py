@@ -23,8 +23,8 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import every_nth
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.looking.sampling import views_about
-from pointsplat_ns.looking.traces import photo_places, trace_factors
+from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.rasterizer import pixels_of
@@ -40,7 +40,7 @@ def visibility_weights(participants: Participants, viewpoints: Viewpoints | None
     step = -(-len(members) // settings.max_count_drawn)
     rows = members if step == 1 else torch.arange(-(-len(members) // step))
     drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
-    weights = covered_per_area(drawn, rows, viewpoints.views, settings)
+    weights = covered_per_area(drawn, rows, participants.views_in_units(viewpoints.views), settings)
     weights = weights.repeat_interleave(step)[: len(members)]
     return weights * trace_factors(scene, members) if viewpoints.photos_found else weights
 
@@ -75,25 +75,24 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
 class Viewpoints:
     """Views that visibility is computed in."""
 
-    views: Views  # in units of the content, see :func:`~pointsplat_ns.looking.content.in_units`
+    views: Views  # in scene units
     photos_found: bool = False
     """Whether views were sampled about where photos were taken, which traces in the scene show."""
 
 
-def sampled_viewpoints(scene: Gaussians, width: int, height: int, settings: MergeSettings) -> Viewpoints | None:
+def sampled_viewpoints(sampler: Sampler, settings: MergeSettings) -> Viewpoints | None:
     """Views from where photos were taken, if traces in the scene show that, and from free places in it.
 
     Args:
-        scene: N Gaussians in units of the content.
-        width, height: size of the pictures, pixels.
+        sampler: of the scene.
         settings: ``sampled_views``, ``view_seed`` and ``find_photo_places``.
 
     Returns:
         The viewpoints; None if no place in the scene is free, or no view is asked for.
     """
-    photos = photo_places(scene) if settings.find_photo_places else None
+    about = settings.find_photo_places
     try:
-        views = views_about(scene, photos, settings.sampled_views, width, height, seed=settings.view_seed, sharp=False)
+        views = sampler.views(settings.sampled_views, settings.view_seed, sharp=False, about_photos=about)
     except DataError:
         return None
-    return Viewpoints(views, photos_found=photos is not None)
+    return Viewpoints(views, photos_found=about and sampler.photos is not None)

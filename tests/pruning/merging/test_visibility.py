@@ -8,8 +8,9 @@ import torch
 
 from making import ball, cloud, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import content_size, in_units, views_in_units
+from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.merging import MERGING, merge, visibility
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.visibility import (
@@ -134,12 +135,10 @@ def test_without_viewpoints_all_weights_are_equal():
 def test_without_a_free_place_there_are_no_viewpoints():
     fog = ball(200)
     fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
-    assert sampled_viewpoints(fog, 32, 24, MERGING) is None
+    assert sampled_viewpoints(Sampler(fog, (32, 24)), MERGING) is None
 
 
 def test_photo_places_are_found_unless_that_is_turned_off():
-    content = photographed()
-    content = in_units(content, *content_size(content))
-    settings = replace(MERGING, sampled_views=2)
-    assert sampled_viewpoints(content, 32, 24, settings).photos_found
-    assert not sampled_viewpoints(content, 32, 24, replace(settings, find_photo_places=False)).photos_found
+    sampler, settings = Sampler(photographed(), (32, 24)), replace(MERGING, sampled_views=2)
+    assert sampled_viewpoints(sampler, settings).photos_found
+    assert not sampled_viewpoints(sampler, replace(settings, find_photo_places=False)).photos_found

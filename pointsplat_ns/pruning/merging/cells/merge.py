@@ -16,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply import PlyRows, header_bytes, ply_bytes, row_table
-from pointsplat_ns.looking.sizes import RESOLUTION
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.duplicates import Copies
 from pointsplat_ns.pruning.merging.cells.overview import Overview, overview_of
 from pointsplat_ns.pruning.merging.cells.partition import CELLS, Cells, divided
@@ -47,7 +47,7 @@ def merge_file(
     most: int,
     scratch: Scratch,
     views: Callable[[Gaussians], Views | None] = lambda sample: None,
-    resolution: tuple[int, int] = RESOLUTION,
+    sampler: Callable[[Gaussians], Sampler] = Sampler,
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
 ) -> tuple[int, int]:
@@ -60,7 +60,7 @@ def merge_file(
         most: largest number of Gaussians in a cell, about.
         scratch: where finished steps are kept.
         views: from every so many-th Gaussian to known views, or None for sampled ones.
-        resolution: width and height of sampled views, pixels.
+        sampler: from Gaussians of the scene to the sampler of their views.
         progress: called with what is being done, and the share done of it.
         settings: the tuned numbers.
 
@@ -81,9 +81,9 @@ def merge_file(
     def look() -> dict[str, Tensor]:
         progress("looking", 0.0)
         with one_thread_each():
-            return vars(overview_of(cells, views(cells.sample), resolution, settings))
+            return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
 
-    work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, resolution, settings)
+    work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     rounds = work.merged(progress)
     with replacing(output, ply_bytes(k, rows.sh_degree, rows.antialiased)) as part, part.open("wb") as stream:
         stream.write(header_bytes(k, rows.sh_degree, rows.antialiased))
@@ -101,7 +101,7 @@ class _Work:
     cells: Cells
     overview: Overview
     k: int
-    resolution: tuple[int, int]
+    sampler: Callable[[Gaussians], Sampler]
     settings: MergeSettings
 
     def merged(self, progress: Progress) -> int:
@@ -188,7 +188,7 @@ class _Work:
                 start = max(0, int(place * len(participants)) - CELLS.finished_part // 2)
                 part = participants.scene[participants.members[start : start + CELLS.finished_part]]
                 few = max(1, len(part) * self.k // self.cells.count)
-                merged = merge(part, few, resolution=self.resolution, settings=self.settings)
+                merged = merge(part, few, views=self.sampler(part), settings=self.settings)
                 changes.append(merged.finish.size_change)
         return {"changes": torch.tensor(changes)}
 

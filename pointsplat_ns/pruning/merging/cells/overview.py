@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.merging.cells.partition import Cells
 from pointsplat_ns.pruning.merging.participants import Participants, drawable
 from pointsplat_ns.pruning.merging.rounds import looked_at
@@ -40,16 +41,15 @@ class Overview:
 
 def overview_of(
     cells: Cells,
-    views: Views | None,
-    resolution: tuple[int, int],
+    views: Views | Sampler,
     settings: MergeSettings,
 ) -> Overview:
-    """The overview of a scene; ``views`` and ``resolution`` as for :func:`~pointsplat_ns.pruning.merging.merge`."""
+    """The overview of a scene; ``views`` as for :func:`~pointsplat_ns.pruning.merging.merge`."""
     share = cells.count / len(cells.sample)
     scene = cells.sample.replace(scales=cells.sample.scales + 0.5 * math.log(share))  # they cover as much as all
     members = drawable(scene, 1)
     participants = Participants(scene, members, *content_size(scene))
-    _, weights = looked_at(participants, views, resolution, settings)
+    _, weights = looked_at(participants, views, settings)
     axes = principal_axes(scene, members, settings)
     size = torch.tensor(participants.size, dtype=torch.float64)
     return Overview(participants.centre, size, cells.keys[members], weights, *axes)
