@@ -128,7 +128,7 @@ def prune(
             a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        views_used: called with the views that merging sampled or was given, if it rendered.
+        views_used: called with the views that merging rendered, given or sampled; not called if it rendered none.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.
@@ -149,14 +149,15 @@ def prune(
         if views_used is not None and merged.views is not None:
             views_used(merged.views)
         return merged.scene
-    return scene[select(score_of(scene, method, views, opacity_weight, progress), count)]
+    given = None if isinstance(views, Sampler) else views
+    return scene[select(score_of(scene, method, given, opacity_weight, progress), count)]
 
 
 @torch.no_grad()
 def score_of(
     scene: Gaussians,
     method: Method,
-    views: Views | Sampler | Callable[[], Views] | None = None,
+    views: Views | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:

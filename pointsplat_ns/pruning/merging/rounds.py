@@ -217,7 +217,7 @@ class Step:
     """Renders of the scene, or of what remained once it was few enough to render."""
 
 
-def looked_at(
+def views_and_weights(
     participants: Participants, views: Views | Sampler | None, settings: MergeSettings
 ) -> tuple[Viewpoints | None, Tensor]:
     """The viewpoints, None for a small scene without known views, and the visibility weights (n,) of participants;
@@ -233,7 +233,7 @@ def looked_at(
 def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeSettings) -> Step:
     """The step before the first round; ``views`` as for :func:`merge`."""
     participants = Participants.of(reduced.scene, reduced.members)
-    viewpoints, weights = looked_at(participants, views, settings)
+    viewpoints, weights = views_and_weights(participants, views, settings)
     state = initial_state(participants, weights, settings)
     tree = Tree.of_single(len(participants))
 

@@ -12,7 +12,7 @@ from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.pruning.merging.cells.partition import Cells
 from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.rounds import looked_at
+from pointsplat_ns.pruning.merging.rounds import views_and_weights
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.pruning.merging.state import ColourAxes, principal_axes
 from pointsplat_ns.views import Views
@@ -49,7 +49,7 @@ def overview_of(
     scene = cells.sample.replace(scales=cells.sample.scales + 0.5 * math.log(share))  # they cover as much as all
     members = drawable(scene, 1)
     participants = Participants(scene, members, *content_size(scene))
-    _, weights = looked_at(participants, views, settings)
+    _, weights = views_and_weights(participants, views, settings)
     axes = principal_axes(scene, members, settings)
     size = torch.tensor(participants.size, dtype=torch.float64)
     return Overview(participants.centre, size, cells.keys[members], weights, *axes)
