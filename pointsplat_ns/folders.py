@@ -64,7 +64,7 @@ def compact_folder(
             file, or is a PLY where that cannot be written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with fewer
             Gaussians than a count is kept whole.
-        refiner: as for :func:`load_refiner`, or "shipped"; None for no refiner.
+        refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
         by: as for :func:`compact`.
         sh: as for :func:`compact`.
         clean: as for :func:`compact`.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import run_on_folder
+from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
     Json,
     end_if_interrupted,
@@ -130,7 +130,7 @@ def compact(
 
         one = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--photos": photos}
         one |= {"--dry-run": dry_run}
-        return run_on_folder(
+        return folder_command(
             ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
             keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
             target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, shard=shard,

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from pointsplat_ns.cli.folders import run_on_folder
+from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
 from pointsplat_ns.cli.scene_options import Scene, claim_outputs, need_no_folder_options
 from pointsplat_ns.system.quantities import seconds_text
@@ -63,7 +63,7 @@ def convert(
         if to is None:
             raise ps.SceneError(f"{scene}: a folder of scenes; expected their new format, such as --to .spz")
         one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
-        return run_on_folder(
+        return folder_command(
             convert_folder, scene, output, one, json_output, jobs,
             suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, shard=shard, force=force,
         )  # fmt: skip

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_task import SceneResult
 
 
-def run_on_folder(
+def folder_command(
     run: Callable[..., list[SceneResult]],
     folder: Path,
     output: Path,

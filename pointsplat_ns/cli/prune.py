@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.cli.folders import run_on_folder
+from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
     Json,
     print_distributions,
@@ -109,7 +109,7 @@ def prune(
         from pointsplat_ns.folders import prune_folder
 
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
-        return run_on_folder(
+        return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
             keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
             resolution=resolution, shard=shard, force=force,

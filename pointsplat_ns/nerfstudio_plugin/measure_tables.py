@@ -54,7 +54,7 @@ def measure_tables(
         scenes: Splatfacto runs, whose held-out photos are then used where they are found; or files of scenes.
         folder: where cells and tables go.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network, as for :func:`load_refiner`; each row takes those that were
+        refiners: weights for the rows with a network, as for :func:`~pointsplat_ns.load_refiner`; each row takes those that were
             trained for it, by what they say of themselves.
         groups: NAME=SCENE,SCENE...; means are taken over groups. By default scenes of Replica and of ScanNet++ are a
             group each, and the others are "scenes".

@@ -28,7 +28,7 @@ from pointsplat_ns.tradeoff.outputs import SWEEP_FILES, write_outputs
 from pointsplat_ns.tradeoff.page import keep_flight
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
 from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting, check_repairs
-from pointsplat_ns.tradeoff.walk import Enough, Plan, walk
+from pointsplat_ns.tradeoff.walk import Enough, Plan, measure_walk
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -123,7 +123,7 @@ class Sweep:
             return self.measure(setting, most)
 
         try:
-            walk(self.plan, measure, dense, self.measurer.cut_psnr)
+            measure_walk(self.plan, measure, dense, self.measurer.cut_psnr)
             self.progress("measuring", 1.0)
         except (KeyboardInterrupt, SystemExit):
             self.finish_early()

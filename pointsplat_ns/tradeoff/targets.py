@@ -102,7 +102,7 @@ class TargetSearch:
         targets: the targets.
         plan: settings to try; only its first method is used.
         measure: from a setting to its point; deterministic.
-        cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.walk`.
+        cut_psnr: as for :func:`~pointsplat_ns.tradeoff.walk.measure_walk`.
         where: text on the views that points are measured in.
         size: bytes of a file by count and SH degree, or an estimate; by default of a PLY.
         exact: whether files keep scenes exactly, as a PLY does.

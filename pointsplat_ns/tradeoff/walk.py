@@ -69,7 +69,7 @@ class Plan:
     """The wanted loss, dB."""
 
 
-def walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], float]) -> None:
+def measure_walk(plan: Plan, measure: Measure, dense: Point, cut_psnr: Callable[[int], float]) -> None:
     """Measure settings, one after the other, until all gaps are flat or the measure raises :class:`Enough`.
 
     ``measure`` is called for one setting more than once. The same points give the same walk, so that an interrupted

@@ -205,7 +205,7 @@ def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_th
     supervision, make_refined_run, trained_walls, tmp_path
 ):
     from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
     shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")
     for folder in ("both", "plys"):
@@ -215,7 +215,7 @@ def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_th
     for data in ("both", "plys", "plys.ply"):
         if supervision == "photos" and data != "both":
             continue
-        _, scenes = find_scenes(tmp_path / data, supervision, MemoryCache(0), need_data=False)
+        _, scenes = training_scenes(tmp_path / data, supervision, MemoryCache(0), need_data=False)
         run_folder = make_refined_run(tmp_path / f"of {data}", tmp_path / data, moved=0.5)
         config = (run_folder / "config.yml").read_text()
         assert "supervision: auto" in config

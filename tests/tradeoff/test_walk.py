@@ -9,7 +9,7 @@ import pytest
 from pointsplat_ns.tradeoff.front import loss_of, psnr_within
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
-from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, walk
+from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, measure_walk
 from trades import Trade
 
 
@@ -25,7 +25,7 @@ def walked(trade: Trade, plan: Plan | None = None, most: int = 100, known: int =
             measured[setting] = trade.measure(setting)
         return measured[setting]
 
-    walk(plan, measure, trade.dense, trade.cut)
+    measure_walk(plan, measure, trade.dense, trade.cut)
     return measured
 
 
@@ -103,6 +103,6 @@ def test_photos_go_before_renders():
         measured[setting] = replace(made, against_photos=replace(made.against_dense, psnr=30.0 + kept))
         return measured[setting]
 
-    walk(Plan(trade.count, 3, repairs=("none",)), measure, dense, trade.cut)
+    measure_walk(Plan(trade.count, 3, repairs=("none",)), measure, dense, trade.cut)
     assert max(setting.count for setting in measured) == 30_000
     assert len(measured) > 6

@@ -22,7 +22,7 @@ from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share, to_device
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import find_scenes
+from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
 
 @dataclass
@@ -99,7 +99,7 @@ class ScenesDataManager(SpiralSource):
         self.cache = MemoryCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
         held_out_poses = max(1, config.sampled_poses // 5)
         poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
-        self.supervision, self.scenes = find_scenes(
+        self.supervision, self.scenes = training_scenes(
             Path(config.data), config.supervision, self.cache, poses, device, need_data=test_mode != "inference"
         )
         names = [scene.name for scene in self.scenes]

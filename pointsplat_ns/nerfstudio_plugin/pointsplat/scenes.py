@@ -150,7 +150,7 @@ class TrainedScene(DenseScene):
         return (self.train_frames if split == "train" else self.eval_frames).dataset.cameras
 
 
-def find_scenes(
+def training_scenes(
     folder: Path,
     supervision: Supervision,
     cache: MemoryCache,

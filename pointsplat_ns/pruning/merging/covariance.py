@@ -98,7 +98,7 @@ def plane_axes(normal: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-def project(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def projected(six: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Covariances (N, 3) of the projections onto the planes of unit vectors ``u`` and ``v`` (N, 3)."""
     return torch.stack([bilinear(six, u, u), bilinear(six, u, v), bilinear(six, v, v)], dim=1)
 

@@ -27,7 +27,7 @@ from pointsplat_ns.pruning.merging.covariance import (
     overlap,
     pack,
     plane_axes,
-    project,
+    projected,
     projected_area,
     rms_area,
     thinnest_axes,
@@ -92,7 +92,7 @@ def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -
     mean = wi[:, None] * state.means[i] + wj[:, None] * state.means[j]
     cov = wi[:, None] * state.cov[i] + wj[:, None] * state.cov[j] + (wi * wj)[:, None] * outer(apart)
     axes = plane_axes(thinnest_axes(cov))
-    si, sj, sk = (project(c, *axes) for c in (state.cov[i], state.cov[j], cov))
+    si, sj, sk = (projected(c, *axes) for c in (state.cov[i], state.cov[j], cov))
     u, v = ((apart * axis).sum(1) for axis in axes)
     mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
     alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)

@@ -10,7 +10,7 @@ from pointsplat_ns.pruning.merging.covariance import (
     covariances,
     overlap,
     plane_axes,
-    project,
+    projected,
     projected_area,
     rms_area,
     thinnest_axes,
@@ -21,7 +21,7 @@ def test_the_area_is_the_root_mean_square_over_directions():
     g = torch.Generator().manual_seed(3)
     six = covariances(torch.randn(1, 3, generator=g).double(), torch.randn(1, 4, generator=g).double())
     ways = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=g).double(), dim=1)
-    areas = projected_area(project(six.expand(len(ways), 6), *plane_axes(ways)))
+    areas = projected_area(projected(six.expand(len(ways), 6), *plane_axes(ways)))
     assert float(rms_area(six)) == pytest.approx(float(areas.square().mean().sqrt()), rel=0.01)  # 200,000 samples
 
 

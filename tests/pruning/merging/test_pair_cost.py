@@ -113,7 +113,7 @@ def test_the_matrices_of_all_directions_project_covariances():
     g = torch.Generator().manual_seed(3)
     six = algebra.covariances(torch.randn(5, 3, generator=g).double(), torch.randn(5, 4, generator=g).double())
     for axes, matrix in zip(PLANE_AXES, TO_PLANE, strict=True):
-        want = algebra.project(six, axes[:, 0].expand(5, 3), axes[:, 1].expand(5, 3))
+        want = algebra.projected(six, axes[:, 0].expand(5, 3), axes[:, 1].expand(5, 3))
         torch.testing.assert_close(six @ matrix, want)
 
 
