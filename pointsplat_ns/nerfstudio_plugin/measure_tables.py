@@ -54,8 +54,8 @@ def measure_tables(
         scenes: Splatfacto runs, whose held-out photos are then used where they are found; or files of scenes.
         folder: where cells and tables go.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network, as for :func:`~pointsplat_ns.load_refiner`; each row takes those that were
-            trained for it, by what they say of themselves.
+        refiners: weights for the rows with a network, as for :func:`~pointsplat_ns.load_refiner`; each row takes those
+            whose metadata name its network and pruning.
         groups: NAME=SCENE,SCENE...; means are taken over groups. By default scenes of Replica and of ScanNet++ are a
             group each, and the others are "scenes".
         only: names or patterns of cells, such as ``fox/merge/10%``, to measure again, and no others.
