@@ -37,11 +37,7 @@ def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def write_wall(scene: Path, num_frames: int = NUM_FRAMES, width: int = WIDTH, height: int = HEIGHT) -> Path:
     """Write exact photos, depth images and poses of a painted wall, in the Replica layout.
 
-    The cameras stand ``WALL_DISTANCE`` before the wall z = 0, look along +z and step sideways.
-
-    Returns:
-        ``scene``.
-    """
+    The cameras stand ``WALL_DISTANCE`` before the wall z = 0, look along +z and step sideways."""
     (scene / "results").mkdir(parents=True)
     cx, cy = (width - 1) / 2, (height - 1) / 2
     camera = {"w": width, "h": height, "fx": FOCAL, "fy": FOCAL, "cx": cx, "cy": cy, "scale": DEPTH_SCALE}

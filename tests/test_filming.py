@@ -14,7 +14,6 @@ import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.transforms import viewmats_to_opengl
-from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.viewing.film import to_uint8
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
@@ -46,15 +45,6 @@ def test_film_of_a_scene_moves(path, tmp_path):
     assert len(frames) == 6 and all(frame.shape == (48, 64, 3) for frame in frames)
     assert all((a != b).mean() > 0.1 for a, b in zip(frames, frames[1:], strict=False))
     assert all(frame.std() > 10 for frame in frames)
-
-
-def test_film_through_given_views_shows_each_of_them(scene, tmp_path):
-    views = ps.sample_views(scene, 3, 64, 48)
-    ps.render_path(scene, tmp_path / "frames", path=views, fps=10, seconds=0.7)
-    frames = frames_in(tmp_path / "frames")
-    for view in views:
-        shown = to_uint8(ps.render(scene, view)).astype(int)
-        assert min(np.abs(frame - shown).max() for frame in frames) <= 1
 
 
 def test_film_of_a_run_goes_exactly_through_its_photos(trained_walls, tmp_path, caplog):
@@ -119,23 +109,6 @@ def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
     ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], split="wipe", seconds=0.3, **SMALL)
     pairs = zip(frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True)
     assert all((one == other).all() for one, other in pairs)
-
-
-def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(files, tmp_path, capsys):
-    (tmp_path / "ball.ply").write_bytes((files / "ball.ply").read_bytes())
-    words = ["render", str(tmp_path / "ball.ply"), "--width", "33", "--height", "25", "--fps", "2", "--seconds", "1"]
-    main(words)
-    assert (tmp_path / "ball.mp4").stat().st_size > 500
-    with pytest.raises(SystemExit):
-        main(words)
-    assert "ball.mp4: exists already" in capsys.readouterr().err
-
-
-def test_picture_is_the_view_that_shows_most(scene, tmp_path):
-    ps.render_path(scene, tmp_path / "one.png", **SMALL)
-    shown = np.asarray(Image.open(tmp_path / "one.png"))
-    best = opening_views(scene, 1, 64, 48).views[0]
-    assert np.abs(shown - to_uint8(ps.render(scene, best)).astype(int)).max() <= 2
 
 
 def test_address_that_cannot_be_listened_on_ends_the_command_in_one_line(files, capsys):

@@ -1,4 +1,4 @@
-"""The scene container: validation, selection and what can be drawn."""
+"""Gaussians and views."""
 
 import math
 
@@ -6,20 +6,15 @@ import pytest
 import torch
 
 from making import normal_scene, same
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians, sh_degree_of
+from pointsplat_ns.views import Views
 
 
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
 def test_sh_degree_follows_from_the_number_of_coefficients(rest, degree):
     assert sh_degree_of(rest) == degree
     assert normal_scene(4, degree).sh_degree == degree
-
-
-@pytest.mark.parametrize("rest", [1, 7, 14, 16, 24])
-def test_other_numbers_of_coefficients_are_refused(rest):
-    with pytest.raises(SceneError, match=f"features_rest has {rest} coefficients"):
-        sh_degree_of(rest)
 
 
 @pytest.mark.parametrize(
@@ -90,11 +85,67 @@ def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
     assert scene.replace(**{name: spoiled}).usable().tolist() == expected
 
 
-def test_usable_holds_for_finite_values_whose_sum_overflows():
-    assert normal_scene().replace(means=torch.full((5, 3), 3e38)).usable().all()
+def make(count=5, width=64, height=48, mode="antialiased"):
+    """Cameras at x = 0, 1, 2... with focal length 50, 51, 52..."""
+    viewmats = torch.eye(4).repeat(count, 1, 1)
+    viewmats[:, 0, 3] = -torch.arange(float(count))
+    Ks = torch.tensor([[50.0, 0.0, 31.0], [0.0, 40.0, 25.0], [0.0, 0.0, 1.0]]).repeat(count, 1, 1)
+    Ks[:, 0, 0] += torch.arange(count)
+    return Views(viewmats, Ks, width, height, torch.tensor([0.1, 0.2, 0.3]), mode)
 
 
-def test_usable_finds_infinities_that_cancel_in_a_sum():
-    means = torch.zeros(5, 3)
-    means[1, 0], means[3, 0] = math.inf, -math.inf
-    assert normal_scene().replace(means=means).usable().tolist() == [True, False, True, False, True]
+def places(views):
+    return [-view.viewmat[0, 3].item() for view in views]
+
+
+def test_a_view_is_drawn_as_its_views_are():
+    view = make()[2]
+    assert (view.width, view.height, view.rasterize_mode) == (64, 48, "antialiased")
+    assert torch.equal(view.background, torch.tensor([0.1, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize(
+    ("index", "expected"),
+    [
+        (slice(1, 3), [1.0, 2.0]),
+        (slice(None, None, 2), [0.0, 2.0, 4.0]),
+        (slice(2, 2), []),
+        ([3, 0, 0], [3.0, 0.0, 0.0]),
+        ([2], [2.0]),
+        (torch.tensor([4, 1]), [4.0, 1.0]),
+        (torch.tensor([True, False, False, True, False]), [0.0, 3.0]),
+    ],
+)
+def test_slices_lists_indices_and_masks_give_views(index, expected):
+    some = make()[index]
+    assert isinstance(some, Views) and len(some) == len(expected)
+    assert places(some) == expected
+    assert (some.width, some.height, some.rasterize_mode) == (64, 48, "antialiased")
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, [0.0]), (2, [0.0, 4.0]), (3, [0.0, 2.0, 4.0]), (0, [])])
+def test_spread_takes_evenly_from_first_to_last(count, expected):
+    assert places(make().spread(count)) == expected
+
+
+def test_resized_views_see_the_same_in_fewer_pixels():
+    views = make()
+    small = views.resized(32)
+    assert (small.width, small.height) == (32, 24)
+    assert torch.equal(small.Ks, views.Ks * torch.tensor([[0.5], [0.5], [1.0]]))
+    assert torch.equal(small.viewmats, views.viewmats)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmats": torch.eye(4)}, r"viewmats .* \(4, 4\); expected \(\d, 4, 4\)"),
+        ({"viewmats": torch.zeros(5, 3, 4)}, r"viewmats .* \(5, 3, 4\); expected \(5, 4, 4\)"),
+        ({"Ks": torch.zeros(4, 3, 3)}, r"Ks .* \(4, 3, 3\); expected \(5, 3, 3\)"),
+        ({"background": torch.zeros(4)}, r"background .* \(4,\); expected \(3,\)"),
+    ],
+)
+def test_a_shape_that_does_not_fit_is_named(change, message):
+    given = {name: getattr(make(), name) for name in ("viewmats", "Ks", "background")}
+    with pytest.raises(DataError, match=message):
+        Views(**{**given, **change}, width=64, height=48)

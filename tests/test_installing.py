@@ -157,16 +157,6 @@ def test_command_says_what_it_lacks_in_one_line(outcomes, line):
     assert FAILS[line] in done["err"]
 
 
-def test_no_command_asks_for_a_network(outcomes):
-    assert not [line for line, done in outcomes.items() if done["tried"]]
-
-
-def test_all_but_the_plugin_can_be_imported_on_a_bare_machine(outcomes):
-    lacking = json.loads(outcomes[MODULES]["out"])
-    assert lacking and all(name.startswith("pointsplat_ns.nerfstudio_plugin.") for name in lacking)
-    assert set(lacking.values()) <= {"nerfstudio", "gsplat", "cv2"}
-
-
 def test_requirements_are_what_is_imported():
     core, more = ({canonicalize_name(requirement.name) for requirement in listed} for listed in (CORE, NERFSTUDIO))
     package = REPOSITORY / "pointsplat_ns"
@@ -177,10 +167,6 @@ def test_requirements_are_what_is_imported():
         (plugin if inside else rest).update(imported - set(sys.stdlib_module_names))
     assert _distributions(rest - WITH_ANOTHER.keys()) <= core
     assert _distributions((plugin | rest) - WITH_ANOTHER.keys()) == (core | more) - BY_NAME
-
-
-def test_who_develops_has_nerfstudio_too():
-    assert any("nerfstudio" in requirement.extras for requirement in map(Requirement, EXTRAS["dev"]))
 
 
 def _distributions(imported: set[str]) -> set[str]:

@@ -87,19 +87,19 @@ _SAME_RESULT = "tests/test_same_result.py"
 PARTS = {
     "rasterizer": Part(
         ("pointsplat_ns/rasterizer/*.py",),
-        ("tests/rasterizer/test_golden.py", "tests/rasterizer/test_alpha.py", "tests/rasterizer/test_projection.py"),
+        ("tests/rasterizer/test_golden.py", "tests/rasterizer/test_input.py", "tests/rasterizer/test_projection.py"),
         ("tests/rasterizer/test_*.py", "tests/pruning/test_view_scores.py", _SAME_RESULT),
         left_out=("constants.py",),
     ),
     "scores": Part(
         tuple(f"pointsplat_ns/pruning/{name}" for name in _SCORES),
-        tuple(f"tests/pruning/test_{name}" for name in _SCORES),
-        ("tests/pruning/test_[ms]e*.py", _SAME_RESULT, "tests/compression/test_prune.py"),
+        ("tests/pruning/test_scores.py", "tests/pruning/test_view_scores.py"),
+        ("tests/pruning/test_[ms]*.py", _SAME_RESULT, "tests/compression/test_prune.py"),
     ),
     "merge": Part(
         ("pointsplat_ns/pruning/**/*.py",),
         (),
-        ("tests/pruning/**/test_*.py", _SAME_RESULT, "tests/compression/test_threads_agree.py"),
+        ("tests/pruning/**/test_*.py", _SAME_RESULT, "tests/compression/test_fine_tune.py"),
         left_out=(*_SCORES, "settings.py"),
     ),
     "refiner": Part(
@@ -110,7 +110,7 @@ PARTS = {
     "repair": Part(
         tuple(f"pointsplat_ns/compression/{name}.py" for name in ("repair", "feedback", "optimiser")),
         (),
-        ("tests/compression/test_[fr]e*.py", "tests/refiner/test_feedback.py", _SAME_RESULT, "tests/compression/*.py"),
+        ("tests/compression/test_[fr]e*.py", "tests/refiner/test_normalize.py", _SAME_RESULT, "tests/compression/*.py"),
     ),
 }
 """Parts of the code. A pattern takes modules and tests that are moved within their folder along."""

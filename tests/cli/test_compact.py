@@ -159,22 +159,6 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply)
 
 
-def test_files_that_exist_are_only_overwritten_by_force(ply, helps, tmp_path, capsys):
-    output, shown = tmp_path / "small.ply", tmp_path / "shown.png"
-    output.write_text("precious")
-    said = refusal(capsys, output, ply, "--refiner", helps)
-    assert f"{output}: exists already" in said and "--force" in said
-    shown.write_text("precious")
-    said = refusal(capsys, tmp_path / "other.ply", ply, "--refiner", helps, "--picture", shown)
-    assert f"{shown}: exists already" in said and "--force" in said
-    assert output.read_text() == shown.read_text() == "precious"
-    page = tmp_path / "page.html"
-    page.write_text("precious")
-    assert f"{page}: exists already" in refusal(capsys, tmp_path / "other.ply", ply, "--refiner", helps, "--html", page)
-    run("compact", ply, "--refiner", helps, "-o", output, "--picture", shown, "--force")
-    assert len(read_ply(output)) == 75 and shown.read_bytes().startswith(b"\x89PNG")
-
-
 def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_said(
     tmp_path, helps, capsys, monkeypatch
 ):

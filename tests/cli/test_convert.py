@@ -21,13 +21,6 @@ def run(*words):
     main([str(word) for word in words])
 
 
-def fails(capsys, *words):
-    with pytest.raises(SystemExit) as ended:
-        run(*words)
-    assert ended.value.code == 1
-    return capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", ["a.spz", "a.sog", "folder/meta.json", "a.splat", "a.compressed.ply", "a.glb"])
 def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, capsys, name):
     run("convert", scene, tmp_path / name)
@@ -44,28 +37,6 @@ def test_convert_cuts_turns_and_scales(scene, tmp_path, capsys):
     assert "SH degree 2 cut to 1" in capsys.readouterr().out
     before, after = ps.load(scene), ps.load(tmp_path / "b.ply")
     assert after.sh_degree == 1 and torch.allclose(after.means[:, 2], -2 * before.means[:, 1], atol=1e-5)
-
-
-def test_convert_writes_spz_of_either_version(scene, tmp_path):
-    run("convert", scene, tmp_path / "a.spz")
-    run("convert", scene, tmp_path / "b.spz", "--spz-version", "4")
-    assert same(ps.load(tmp_path / "a.spz"), ps.load(tmp_path / "b.spz"))
-    assert (tmp_path / "b.spz").read_bytes()[:4] == b"NGSP"
-
-
-def test_convert_overwrites_nothing_and_names_what_it_can_write(scene, tmp_path, capsys):
-    assert "exists already" in fails(capsys, "convert", scene, scene)
-    assert ".spz, .sog" in fails(capsys, "convert", scene, tmp_path / "a.ksplat")
-    assert "not a Splatfacto run" in fails(capsys, "convert", scene, tmp_path / "b.ply", "--original-frame")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
-def test_prune_writes_other_formats_and_counts_their_bytes(scene, tmp_path, capsys):
-    run("prune", scene, "--by", "opacity", "--keep", "0.004MB", "-o", tmp_path / "s.splat")
-    assert (tmp_path / "s.splat").stat().st_size == 32 * 125
-    run("prune", scene, "--by", "opacity", "--keep", "0.004MB", "-o", tmp_path / "s.spz")
-    assert 3500 <= (tmp_path / "s.spz").stat().st_size <= 4000
-    assert "sizes tried" in capsys.readouterr().out
 
 
 def test_info_prints_a_page_or_json(scene, capsys):

@@ -1,4 +1,4 @@
-"""Whatever goes wrong around a command ends it with one line and exit status 1."""
+"""The command line: help, words that are read, errors."""
 
 import contextlib
 import io
@@ -13,7 +13,9 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
+from pointsplat_ns import cli
 from pointsplat_ns.cli import main
+from pointsplat_ns.cli.help import EXAMPLES
 
 ALLOCATION = 1 << 60
 """Bytes that no machine has."""
@@ -136,3 +138,62 @@ def test_no_name_steers_the_terminal(words, shown, tmp_path, monkeypatch, capsys
     out, err = capsys.readouterr()
     assert shown in out + err
     assert not re.search(r"[^\n\x20-\x7e\xa0-\U0010ffff]", out + err)
+
+
+def shown(capsys, *words: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main([*words])
+    assert end.value.code in (None, 0)
+    return capsys.readouterr().out
+
+
+def listed(text: str) -> list[str]:
+    """The commands that the usage of the program lists."""
+    return re.search(r"usage: pointsplat \[-h\] \{([\w,-]+)\}", text)[1].split(",")
+
+
+def test_every_command_has_examples_of_itself(capsys):
+    assert listed(shown(capsys, "--help")) == [*EXAMPLES]
+    for name, examples in EXAMPLES.items():
+        assert examples and all(shlex.split(command)[:2] == ["pointsplat", name] for _, command in examples)
+
+
+def test_a_command_line_that_is_not_understood_has_status_2(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["prune", "room.ply", "--keeep", "10%"])
+    said = capsys.readouterr()
+    assert end.value.code == 2 and "--keeep" in said.err and said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        ("prune a.ply --fine-tune 1k", "fine_tune", 1000),
+        ("make-refiner --steps 1,000", "steps", 1000),
+        ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
+        ("demo --keep 20%", "keep", 0.2),
+        ("tables a.ply -o t --keeps 50% 0.1", "keeps", (0.5, 0.1)),
+    ],
+)
+def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):
+    called, real = {}, cli._command
+
+    def watched(command):
+        function = real(command)
+
+        def instead(**options):
+            called.update(options)
+
+        instead.__signature__, instead.__wrapped__ = __import__("inspect").signature(function), function
+        instead.__annotations__, instead.__doc__ = function.__annotations__, function.__doc__
+        return instead
+
+    monkeypatch.setattr(cli, "_command", watched)
+    main(words.split())
+    assert called[name] == value
+
+
+def test_what_is_no_number_is_refused_with_those_that_are(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["prune", "a.ply", "--fine-tune", "1.5"])
+    assert end.value.code == 2 and "is no whole number" in " ".join(capsys.readouterr().err.split())

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import re
 from pathlib import Path
 
 import pytest
@@ -58,29 +57,6 @@ def test_prune_convert_and_export_say_what_they_wrote(ply, as_json):
     assert "gaussians_before" not in exported
 
 
-def test_compact_says_what_helped_of_one_scene_and_of_a_folder(ply, as_json):
-    made = as_json("compact", ply, "--keep", "50%", "--effort", "instant")
-    assert len(written(made)) == COUNT // 2
-    assert made["refined"] in (True, False) and made["repaired"] is False and made["psnr"] > 5
-    assert made["quality"]["psnr"] > 5 and (made["quality"]["width"], made["quality"]["height"]) == (64, 48)
-    Path("rooms").mkdir()
-    ply.rename("rooms/a.ply")
-    many = as_json("compact", "rooms", "--keep", "50%", "--effort", "instant")
-    assert Path(many["output"]).resolve() == Path("rooms_compact").resolve()
-    assert [(scene["name"], scene["status"], scene["after"]) for scene in many["scenes"]] == [("a", "done", COUNT // 2)]
-
-
-def test_a_scene_that_fails_is_in_the_json_and_in_the_status(ply, capsys):
-    Path("rooms").mkdir()
-    Path("rooms/a.ply").write_bytes(ply.read_bytes()[:-7])
-    with pytest.raises(SystemExit) as end:
-        main(["compact", "rooms", "--keep", "50%", "--json"])
-    said = capsys.readouterr()
-    [scene] = json.loads(said.out)["scenes"]
-    assert end.value.code == 1 and scene["status"] == "failed" and "truncated" in scene["error"]
-    assert "error: 1 of 1 scenes failed" in said.err
-
-
 def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_lpips, tmp_path, monkeypatch):
     assert as_json("lod", ply, "--levels", "50%") == {
         "output": "room_lod",
@@ -101,14 +77,6 @@ def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_
     }
 
 
-def test_render_and_rooms_say_what_they_wrote(ply, as_json, coarse_rooms):
-    film = as_json("render", ply, "-o", "frames", "--width", "16", "--height", "12", "--fps", "2", "--seconds", "1")
-    assert film["output"] == "frames" and film["frames"] == len([*Path("frames").iterdir()]) == 2
-    assert film["bytes"] == sum(path.stat().st_size for path in Path("frames").iterdir())
-    made = as_json("rooms", "-o", "rooms", "--seeds", "3", "--frames", "2", "--width", "16", "--height", "12")
-    assert made == {"output": "rooms", "rooms": ["rooms/room3"]} and Path("rooms/room3/traj.txt").is_file()
-
-
 def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys, monkeypatch):
     found = ps.info(ball(5))
 
@@ -122,24 +90,6 @@ def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys
     said = capsys.readouterr()
     assert json.loads(said.out)["gaussians"] == 5
     assert said.err.splitlines() == ["a library speaks", "a finding"]
-
-
-def test_numbers_that_json_lacks_are_null(capsys, ply):
-    torch.manual_seed(1)
-    main(["compact", str(ply), "--keep", "100%", "--by", "opacity", "--effort", "instant", "--dry-run", "--json"])
-    assert "Infinity" not in (said := capsys.readouterr().out) and json.loads(said)["gaussians"] == COUNT
-
-
-def test_prune_says_in_two_lines_what_it_wrote_and_how_good_it_is(ply, capsys, as_json):
-    words = ("prune", str(ply), "--keep", "50%", "--resolution", "96x54", "--force")
-    main([*words, "-o", "room.spz"])
-    written, quality = capsys.readouterr().out.splitlines()
-    size = Path("room.spz").stat().st_size
-    assert written.startswith(f"room.spz: merged to 30 of 60 Gaussians (50 %), {size / 1e3:.3g} kB, in ")
-    psnr = re.fullmatch(r"([\d.]+) dB PSNR against the dense scene \(8 views, 96 x 54\)", quality)[1]
-    found = as_json(*words, "-o", "room.spz")
-    assert (found["views"], found["width"], found["height"]) == (8, 96, 54)
-    assert f"{found['psnr']:.1f}" == psnr
 
 
 def test_what_was_chosen_for_the_scene_and_distributions_are_printed_if_asked_for(ply, capsys):

@@ -1,11 +1,8 @@
 """pointsplat prune and export: what they write, and what they say of input that cannot be used."""
 
 import json
-import logging
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import psutil
@@ -62,26 +59,6 @@ def refusal(capsys, output: Path, *args, warnings: int = 0) -> str:
     return error
 
 
-@pytest.mark.parametrize("kind", ["ply", "folder", "config", "ckpt", "bare ckpt"])
-def test_prune_takes_every_kind_of_scene(kind, ply, splatfacto_run, tmp_path, capsys):
-    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
-    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
-    scene = {
-        "ply": ply,
-        "folder": splatfacto_run,
-        "config": splatfacto_run / "config.yml",
-        "ckpt": checkpoint,
-        "bare ckpt": tmp_path / "alone.ckpt",
-    }[kind]
-    output = tmp_path / "new" / "out.ply"
-    run("prune", scene, "--keep", "0.5", "--by", "paper", "-o", output)
-    dense = read_scene(scene)
-    assert same(read_ply(output), prune(dense, 0.5, "paper"))
-    said = capsys.readouterr().out
-    assert str(output) in said and f"of {len(dense):,} Gaussians" in said and " kB, in " in said
-    assert [p.name for p in output.parent.iterdir()] == ["out.ply"]
-
-
 def test_prune_scores_as_it_is_told(ply, tmp_path):
     run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
     run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
@@ -102,13 +79,6 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
         assert "opacity_weight is 2.0; expected 0 to 1" in said
     write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
     assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
-
-
-def test_an_output_that_cannot_be_written_is_refused(ply, tmp_path, capsys):
-    assert ".spz, .sog" in refusal(capsys, tmp_path / "out.obj", "prune", ply)
-    (tmp_path / "folder.ply").mkdir()
-    assert "is a folder" in refusal(capsys, tmp_path / "folder.ply", "prune", ply)
-    assert "cannot be written" in refusal(capsys, ply / "below_a_file.ply", "prune", ply)
 
 
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
@@ -143,13 +113,6 @@ def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, messa
     assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "not_there.ply", *options)
 
 
-def test_a_ply_is_written_beside_the_scene_where_no_name_is_given_and_it_is_said(ply, capsys):
-    run("prune", ply, "--keep", "10%")
-    assert sorted(p.name for p in ply.parent.iterdir()) == ["scene.ply", "scene_pruned.ply"]
-    assert same(read_ply(ply.with_name("scene_pruned.ply")), prune(read_ply(ply), 0.1, "merge"))
-    assert f"{ply.with_name('scene_pruned.ply')}: merged to 8 of 80 Gaussians" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("named", ["folder", "config", "ckpt", "ckpt seen from its folder"])
 def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, splatfacto_run, tmp_path, monkeypatch):
     folder = tmp_path / "run"
@@ -161,43 +124,6 @@ def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named,
         monkeypatch.chdir(checkpoint.parent)
     run("prune", scene, "--keep", "10%", "--by", "opacity")
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_a_scene_that_exists_is_only_overwritten_by_force(named, ply, capsys):
-    output = ply.with_name("mine.ply" if named else "scene_pruned.ply")
-    options = ("-o", output) if named else ()
-    output.write_text("precious")
-    with pytest.raises(SystemExit) as caught:
-        run("prune", ply, *options)
-    said = capsys.readouterr().err
-    assert caught.value.code == 1
-    assert f"{output}: exists already" in said and "--force" in said
-    assert output.read_text() == "precious"
-    run("prune", ply, *options, "--force")
-    assert len(read_ply(output)) == 24
-
-
-def test_the_log_of_the_package_is_printed_while_a_command_runs_and_no_longer(ply, tmp_path, capsys):
-    logger = logging.getLogger("pointsplat_ns")
-    before = logger.handlers, logger.propagate, logger.level
-    content = bytearray(ply.read_bytes())
-    first_row = content.index(b"end_header\n") + len(b"end_header\n")
-    content[first_row : first_row + 4] = b"\xff" * 4  # NaN
-    (tmp_path / "spoiled.ply").write_bytes(content)
-    run("prune", tmp_path / "spoiled.ply", "--by", "opacity", "--sh", "0", "--keep", "9")
-    said = capsys.readouterr()
-    assert "SH degree 3 cut to 0" in said.out
-    assert "dropped 1 of 80 Gaussians" in said.err and "dropped" not in said.out
-    assert (logger.handlers, logger.propagate, logger.level) == before
-
-
-def test_export_writes_the_scene_of_a_splatfacto_run_as_it_is(splatfacto_run, tmp_path):
-    (checkpoint,) = (splatfacto_run / "nerfstudio_models").iterdir()
-    shutil.copy(checkpoint, tmp_path / "alone.ckpt")
-    for i, path in enumerate((splatfacto_run, splatfacto_run / "config.yml", checkpoint, tmp_path / "alone.ckpt")):
-        run("export", path, "-o", tmp_path / f"{i}.ply")
-        assert same(read_ply(tmp_path / f"{i}.ply"), read_scene(checkpoint))
 
 
 @pytest.mark.parametrize("supervision", ["auto", "photos", "dense"])
@@ -241,23 +167,6 @@ def test_export_says_that_the_scenes_of_a_run_are_gone(make_refined_run, tmp_pat
     assert "its data" in refusal(capsys, tmp_path / "out.ply", "export", folder)
 
 
-def test_export_refuses_a_scene_that_is_not_there(refined_run, splatfacto_run, ply, tmp_path, capsys):
-    output = tmp_path / "out.ply"
-    assert "wall-a, wall-b" in refusal(capsys, output, "export", refined_run, "--scene", "attic")
-    assert "holds one scene" in refusal(capsys, output, "export", splatfacto_run, "--scene", "wall-a")
-    assert "gone: no such file" in refusal(capsys, output, "export", tmp_path / "gone")
-    assert "without config.yml" in refusal(capsys, output, "export", tmp_path)
-
-
-def test_the_command_as_installed_refuses_with_status_1_and_one_line(tmp_path):
-    code = "from pointsplat_ns.cli import main; main()"
-    arguments = ["compact", "gone.ply", "--refiner", "gone", "-o", str(tmp_path / "out.ply")]
-    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 1 and done.stdout == ""
-    assert done.stderr.startswith("error: gone: no such file") and done.stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture()
 def posed(tmp_path) -> tuple[Path, Path]:
     """A room, and a file of cameras in it."""
@@ -273,16 +182,6 @@ def test_poses_of_a_file_are_looked_from(posed, tmp_path, capsys):
     views = read_views(poses)
     assert same(read_ply(tmp_path / "small.ply"), ps.prune(read_ply(room), "20%", "lightgaussian", views=views))
     assert same(read_ply(tmp_path / "small.ply"), ps.prune(room, "20%", "lightgaussian", views=poses))
-
-
-def test_poses_in_another_frame_are_refused_before_the_work(posed, tmp_path, capsys):
-    room, poses = posed
-    content = json.loads(poses.read_text())
-    for camera in content:
-        camera["position"][0] += 1e4
-    written(content, poses)
-    error = refusal(capsys, tmp_path / "small.ply", "prune", room, "--poses", poses)
-    assert f"{poses}: 0 of 5 cameras see anything of the scene" in error and "dataparser_transforms.json" in error
 
 
 def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):

@@ -166,7 +166,7 @@ def quick(monkeypatch, tmp_path):
 
 
 @settings(
-    max_examples=100,
+    max_examples=50,
     derandomize=True,
     database=None,
     deadline=None,

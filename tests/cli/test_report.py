@@ -1,9 +1,13 @@
-"""The commands that make data and show results."""
+"""Reports, in JSON and as a page."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
+import pointsplat_ns as ps
+from browser import chromium, complaints
 from evaluations import WRONG, evaluation, places
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
@@ -19,46 +23,6 @@ def test_report_shows_every_scene_and_variant(tmp_path, capsys):
     assert [row[:2] for row in rows[:2]] == [["a", "yes"], ["b", "never"]]
     assert "compared with held-out photos" in " ".join(shown.split())  # a title may be wrapped
     assert shown.count("refined") == 5 and "25.00" in shown and "1,000" in shown and "0.250" in shown
-
-
-def test_report_shows_a_dash_where_lpips_is_unknown(tmp_path, capsys):
-    path = tmp_path / "eval.json"
-    path.write_text(json.dumps(evaluation(lpips=None)))
-    main(["report", str(path)])
-    assert " - " in capsys.readouterr().out
-
-
-def test_report_keeps_what_was_compared_with_photos_apart_from_what_was_compared_with_dense_renders(tmp_path, capsys):
-    content = evaluation()
-    results = content["results"]
-    first = results["scenes"]["a"]
-    only_dense = {row: {**first[row], "psnr": 44.0} for row in ("pruned", "refined")}
-    only_dense["dense"] = {**first["dense"], "psnr": None}
-    results["reference"] = "photos"
-    for scene in results["scenes"].values():
-        scene["reference"] = "photos"
-    for name in ("c", "d"):
-        results["scenes"][name] = {"seen_in_training": False, "reference": "dense renders", **only_dense}
-    results["against_dense_renders"] = {"reference": "dense renders", "average": only_dense}
-    path = tmp_path / "eval.json"
-    path.write_text(json.dumps(content))
-    main(["report", str(path)])
-    photos, dense = capsys.readouterr().out.split("compared with the dense scenes' own")
-    assert "held-out photos" in photos and "44.00" not in photos and photos.count("average") == 3
-    assert "25.00" not in dense and dense.count("44.00") == 6 and dense.count("average") == 1
-    names = {line.replace("│", " ").split()[0] for line in dense.splitlines() if " dense " in line}
-    assert names == {"c", "d", "average"}
-
-
-@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"results": {"psnr": 3.0}}', '{"results": {"scenes": {}}}'])
-def test_report_of_something_else_is_one_line_and_status_1(tmp_path, capsys, content):
-    path = tmp_path / "eval.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(SystemExit) as end:
-        main(["report", str(path)])
-    error = capsys.readouterr().err
-    assert end.value.code == 1 and str(path) in error and error.count("\n") == 1
 
 
 def test_results_that_are_malformed_anywhere_are_shown_or_one_error(tmp_path, capsys):
@@ -81,16 +45,51 @@ def test_results_that_are_malformed_anywhere_are_shown_or_one_error(tmp_path, ca
     assert refused > 300 and shown > 0
 
 
-def test_names_of_scenes_are_shown_as_they_are(tmp_path, capsys):
-    content = evaluation()
-    content["results"]["scenes"]["[/b]"] = content["results"]["scenes"].pop("b")
-    path = tmp_path / "eval.json"
-    path.write_text(json.dumps(content))
-    main(["report", str(path)])
-    assert "[/b]" in capsys.readouterr().out
+def write(folder: Path, content: dict) -> Path:
+    (folder / "eval.json").write_text(json.dumps(content))
+    return folder / "eval.json"
 
 
-def test_rooms_are_named_by_their_seeds(tmp_path, coarse_rooms):
-    main(["rooms", "-o", str(tmp_path / "r"), "--seeds", "3", "--frames", "2", "--width", "32", "--height", "24"])
-    assert sorted(p.name for p in (tmp_path / "r").iterdir()) == ["room3"]
-    assert len(list((tmp_path / "r" / "room3" / "results").glob("frame*"))) == 2
+@pytest.fixture()
+def page(tmp_path) -> Path:
+    main(["report", str(write(tmp_path, evaluation())), "--html", str(tmp_path / "eval.html")])
+    return tmp_path / "eval.html"
+
+
+def marks_of(text: str) -> list[str]:
+    return re.findall(r'role="img" aria-label="(.*?)"', text)
+
+
+def test_page_draws_every_scene_variant_and_value(page, capsys):
+    text = page.read_text("utf-8")
+    assert len(marks_of(text)) == 3 * 5, "three charts of two scenes and three averages"
+    assert "a, PSNR, dB: dense 30.00, pruned 20.00, refined 25.00" in marks_of(text)
+    assert "b (never seen), LPIPS, less is better: dense 0.250, pruned 0.250, refined 0.250" in marks_of(text)
+    assert [
+        re.findall(f"<td>{value}</td>", text) != [] for value in ("30.00", "0.900", "0.250", "1,000", "0.24", "12.0")
+    ]
+    assert "keep 0.1, by paper, refiner tiny" in text and "held-out photos" in text
+    places_of = [float(place) for place in re.findall(r'<svg x="([\d.]+)%"', text)][:3]
+    assert places_of[1] < places_of[2] < places_of[0], "the pruned scene is the worst, the dense one the best"
+    assert places_of[2] == pytest.approx((places_of[0] + places_of[1]) / 2, abs=0.01)
+
+
+def test_page_without_lpips_has_no_chart_of_it_and_says_why(tmp_path):
+    content = evaluation(lpips=None)
+    content["results"]["lpips_note"] = "no weights here"
+    ps.report(write(tmp_path, content), tmp_path / "eval.html")
+    text = (tmp_path / "eval.html").read_text("utf-8")
+    assert not [mark for mark in marks_of(text) if "LPIPS" in mark] and "no LPIPS: no weights here" in text
+    assert text.count("<td>–</td>") == 5 * 3
+
+
+def test_page_is_drawn_by_a_browser(page):
+    with chromium() as browser:
+        browser.get(page.as_uri())
+        boxes = browser.execute_script(
+            "return [...document.querySelectorAll('.dots-row svg svg path')].map((e) => {"
+            "const b = e.getBoundingClientRect(); return [b.x, b.width, b.height]})"
+        )
+        assert len(boxes) == 45 and all(width > 5 and height > 5 for _, width, height in boxes)
+        assert boxes[1][0] < boxes[2][0] < boxes[0][0]
+        assert complaints(browser) == []

@@ -106,16 +106,6 @@ def test_a_refiner_that_helps_is_kept_and_the_figures_are_those_of_the_renders(s
     )
 
 
-def test_a_refiner_that_harms_is_left_out_and_both_figures_are_said(scene, views):
-    result = compacted(scene, trained(tiny_refiner("features_dc", -2.0)), views)
-    assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
-    assert not same(result.refined, result.scene)
-    assert result.after.psnr < result.before.psnr
-    assert result.verdict.startswith("not refined by the network, it does not help: ")
-    assert f"{result.before.psnr:.1f} -> {result.after.psnr:.1f} dB" in result.verdict
-    assert "closer in 0)" in result.verdict
-
-
 def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
     far = trained(tiny_refiner("scales", 0.8))
     pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
@@ -204,21 +194,6 @@ def test_one_gaussian_is_compacted_and_none_are_refused(scene, short_search):
             compacted(nothing, trained(tiny_refiner()), None)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({}, {}),
-        ({"keep": 30, "by": "merge", "sh": "0"}, {"keep": 30, "by": "merge", "sh": "0", "opacity_weight": None}),
-        ({"by": "authors"}, {"by": "authors"}),  # the weight of the training serves every method that weighs opacity
-        ({"by": "log-volume", "clean": True}, {"by": "log-volume", "clean": True}),
-    ],
-)
-def test_options_go_before_what_the_refiner_was_trained_with(options, expected):
-    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
-    trained_with = {"keep": 0.25, "by": "paper", "opacity_weight": 0.9}
-    assert CompactRequest.of(refiner, **options).prune == PruneRequest(**{**trained_with, **expected})
-
-
 def test_the_scene_is_pruned_as_the_request_says(scene, views):
     refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
     assert same(compacted(scene, refiner, views).pruned, prune(scene, 0.25, "paper", opacity_weight=0.9))
@@ -239,15 +214,6 @@ def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, v
     strong = scene.replace(features_rest=scene.features_rest * 20)  # auto keeps the band: only now it is known
     with pytest.raises(SceneError, match="SH degree 1.*at most 0"):
         compacted(strong, refiner, views, sh="auto")
-
-
-def test_progress_names_what_is_done_and_never_goes_back(scene, views):
-    steps = []
-    refiner = trained(tiny_refiner("scales", 0.2), by="merge")
-    compacted(scene, refiner, views, lambda what, share: steps.append((what, share)))
-    assert list(dict.fromkeys(what for what, _ in steps)) == ["by merge", "comparing renders", "refining"]
-    shares = [share for what, share in steps if what == "comparing renders"]
-    assert shares == sorted(shares) and shares[-1] == 1 and all(0 <= share <= 1 for _, share in steps)
 
 
 @pytest.mark.parametrize(
@@ -272,47 +238,6 @@ def test_a_repair_that_helps_is_kept_and_one_that_harms_is_left_out(change, kept
     assert ("interrupted" in line) == (not kept)
 
 
-@pytest.mark.parametrize("kept", [True, False], ids=["kept", "left out"])
-def test_the_result_is_on_the_dense_scenes_device_whether_or_not_a_repair_is_kept(
-    kept, scene, views, monkeypatch, repaired_to
-):
-    other = torch.device("meta")  # in place of CUDA; what comes back from it are zeros
-    errors = iter([1e-2, *(5 * [1e-3 if kept else 1e-1])])
-
-    class Judge:
-        def __init__(self, dense: Gaussians, views: ViewSource):
-            self.device = dense.device
-            self.reference = SimpleNamespace(closeness=lambda *_: Closeness((next(errors),), (1.0,)))
-
-        def psnrs(self, scene: Gaussians) -> list[float]:
-            return []
-
-    def moved(scene: Gaussians, device: torch.device) -> Gaussians:
-        return scene.map(lambda value: torch.zeros_like(value, device=device) if value.is_meta else value.to(device))
-
-    monkeypatch.setattr(Gaussians, "to", moved)
-    monkeypatch.setattr(CompactRequest, "device", other)
-    monkeypatch.setattr(compact_module, "Comparison", Judge)
-    repaired_to(prune(scene, 0.5, "opacity").to(other))
-    result = compacted(scene, None, views, keep=0.5, by="opacity", repair=REPAIRED)
-    assert result.repair_accepted == kept and len(result.stages) == 2
-    assert {stage.scene.device for stage in result.stages} == {scene.device}
-
-
-def test_a_repair_knows_how_close_the_scene_is_where_there_is_anything(scene, views, monkeypatch):
-    told = []
-
-    def repair(scene, *_, psnr, **others):
-        told.append(psnr)
-        return Repaired(scene, 5, 0.5, False)
-
-    monkeypatch.setattr(compact_module, "repair", repair)
-    result = compacted(scene, trained(tiny_refiner()), views, repair=REPAIRED)
-    covered = sum(result.reference.covered) / len(views)
-    assert covered < 0.97  # so the PSNR over all pixels is another
-    assert told == [result.before.psnr] == [pytest.approx(-10 * math.log10(result.before.error / covered))]
-
-
 def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, repaired_to):
     pruned, reference = prune(scene, 0.5, "opacity"), DenseReference(scene, views)
     made = pruned.replace(scales=pruned.scales + 0.6)
@@ -324,13 +249,6 @@ def test_a_repair_that_goes_too_far_is_kept_in_part(scene, views, repaired_to):
     share = (result.scene.scales - pruned.scales).mean() / 0.6
     assert 0 < share < 1 and torch.equal(result.scene.means, pruned.means)
     assert f"repaired by 5 steps in 0.5 s, {share:.0%} of the change kept: " in result.verdict
-
-
-def test_what_cannot_be_compared_or_is_as_good_as_can_be_is_not_repaired(scene, views, monkeypatch):
-    monkeypatch.setattr(compact_module, "repair", None)  # a call of it would fail
-    blind = compacted(scene, trained(tiny_refiner()), NoViews(scene), repair=REPAIRED)
-    whole = compacted(scene, trained(tiny_refiner()), views, keep=1.0, repair=REPAIRED)
-    assert blind.repaired is None and whole.repaired is None and same(whole.scene, scene)
 
 
 def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired_to):
@@ -368,3 +286,30 @@ def test_without_a_refiner_the_scene_is_only_pruned_and_compared(scene, views):
     assert same(result.scene, result.pruned) and result.after is None and len(result.scene) == len(scene) // 10
     assert result.verdict.startswith(f"not repaired: {result.psnr:.1f} dB")
     assert compacted(scene, None, NoViews(scene)).verdict.startswith("not refined or repaired: it cannot be compared")
+
+
+@pytest.mark.parametrize("kept", [True, False], ids=["kept", "left out"])
+def test_the_result_is_on_the_dense_scenes_device_whether_or_not_a_repair_is_kept(
+    kept, scene, views, monkeypatch, repaired_to
+):
+    other = torch.device("meta")  # in place of CUDA; what comes back from it are zeros
+    errors = iter([1e-2, *(5 * [1e-3 if kept else 1e-1])])
+
+    class Judge:
+        def __init__(self, dense: Gaussians, views: ViewSource):
+            self.device = dense.device
+            self.reference = SimpleNamespace(closeness=lambda *_: Closeness((next(errors),), (1.0,)))
+
+        def psnrs(self, scene: Gaussians) -> list[float]:
+            return []
+
+    def moved(scene: Gaussians, device: torch.device) -> Gaussians:
+        return scene.map(lambda value: torch.zeros_like(value, device=device) if value.is_meta else value.to(device))
+
+    monkeypatch.setattr(Gaussians, "to", moved)
+    monkeypatch.setattr(CompactRequest, "device", other)
+    monkeypatch.setattr(compact_module, "Comparison", Judge)
+    repaired_to(prune(scene, 0.5, "opacity").to(other))
+    result = compacted(scene, None, views, keep=0.5, by="opacity", repair=REPAIRED)
+    assert result.repair_accepted == kept and len(result.stages) == 2
+    assert {stage.scene.device for stage in result.stages} == {scene.device}

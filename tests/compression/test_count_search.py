@@ -1,12 +1,30 @@
-"""The search for a count: it meets the target, ends near it, and needs few tries, whatever the measure is like."""
+"""Searches for a count and for a size."""
 
 import math
 
 import pytest
 
-from pointsplat_ns.compression.budget_search import SearchSettings, find_count
+from making import cloud
+from pointsplat_ns.compression.budget_search import (
+    BUDGETS,
+    FileLimit,
+    SearchSettings,
+    find_count,
+    largest_within,
+    needed_sh_degree,
+    smallest_within,
+)
+from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.requests import PruneRequest
+from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.io.formats import Format, format_to_write
+from pointsplat_ns.io.formats.rounding import Rounding
+from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
 
 MOST = 100_000
+
 MEASURES = {
     "straight over the logarithm": lambda count: 40 + 6 * math.log(count / MOST),
     "bent": lambda count: 40 * (count / MOST) ** 0.2,
@@ -46,12 +64,6 @@ def test_the_count_meets_the_target_and_a_neighbour_that_was_tried_does_not(name
     assert len(tried) <= 16
 
 
-def test_a_known_slope_saves_tries():
-    measure = MEASURES["straight over the logarithm"]
-    blind, told = (len(searched(measure, 28.0, True, slope=slope)[1]) for slope in (None, 6.0))
-    assert told < blind
-
-
 def test_a_count_near_enough_to_the_target_ends_the_search():
     near = SearchSettings(tolerance=0.1)
     found, tried = searched(MEASURES["straight over the logarithm"], 28.0, True, slope=6.0, settings=near)
@@ -70,3 +82,120 @@ def test_bounds_are_tried_before_it_gives_up():
     assert found.count is None and MOST in tried
     found, tried = searched(MEASURES["bent"], 1.0, False, least=100)
     assert found.count is None and min(tried) == 100
+
+
+@pytest.mark.parametrize("wanted", [22.0, 30.0])
+def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_ball, ball_views, wanted):
+    scores = score_of(hollow_ball, METHODS["coverage"])
+    calls, shares = [], []
+
+    def make(count):
+        calls.append(count)
+        return hollow_ball[select(scores, count)]
+
+    found = smallest_within(hollow_ball, make, ball_views, wanted, shares.append)
+    reference = DenseReference(hollow_ball, ball_views)
+    assert found.psnr == reference.psnr(found.scene)[0] >= wanted and found.worst <= found.psnr + 1e-9
+    count = len(found.scene)
+    below = [k for k in calls if k < count]
+    assert found.psnr <= wanted + BUDGETS.psnr.tolerance or count <= max(
+        max(below) * BUDGETS.psnr.precision, max(below) + 1
+    )
+    assert all(found.tried[k] < wanted for k in below)
+    assert len(calls) == len(set(calls)) <= 8 and all(0 <= share <= 1 for share in shares)
+
+
+def test_a_psnr_that_any_scene_reaches_keeps_one_gaussian(hollow_ball, ball_views):
+    assert len(smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views, 0.1).scene) == 1
+
+
+def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
+    with pytest.raises(BudgetError, match="all 1500 Gaussians reach .* dB, not 60 dB"):
+        smallest_within(hollow_ball, lambda k: cut_sh(hollow_ball, 0)[:k], ball_views, 60.0)
+    for wanted in (0.0, -3.0, math.nan, math.inf):
+        with pytest.raises(BudgetError, match="expected a positive number"):
+            smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views, wanted)
+    with pytest.raises(BudgetError, match="no view"):
+        smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views[:0], 30.0)
+
+
+def test_the_sh_degree_found_is_the_lowest_that_is_good_enough(hollow_ball, ball_views):
+    reference = DenseReference(hollow_ball, ball_views)
+    reached = [reference.psnr(cut_sh(hollow_ball, degree))[0] for degree in range(3)]
+    assert reached[0] < reached[1] < reached[2] == math.inf
+    for degree in (0, 1):
+        assert needed_sh_degree(hollow_ball, ball_views, reached[degree] - 0.01) == (
+            degree,
+            pytest.approx(reached[degree]),
+        )
+    assert needed_sh_degree(hollow_ball, ball_views, reached[1] + 0.01) == (2, math.inf)
+
+
+def search(full, limit, encode=encode_spz):
+    limit = FileLimit(Format("SPZ", ".spz", encode=encode), limit)
+    return largest_within(full, lambda count: full[:count], limit, lambda share: None)
+
+
+def test_the_file_fits_and_is_not_much_smaller():
+    full = cloud(4000)
+    for limit in (5000, 20_000, 60_000):
+        found = search(full, limit)
+        size = found.tried[len(found.scene)]
+        assert 0.95 * limit <= size <= limit
+        assert size == len(encode_spz(found.scene))
+
+
+def test_a_budget_for_less_than_one_gaussian_is_refused():
+    with pytest.raises(BudgetError, match="too small for one Gaussian; expected at least"):
+        search(cloud(100), 10)
+
+
+def test_a_size_that_jumps_ends_the_search_with_what_fits():
+    # Beyond 50 Gaussians the file is ten times as large.
+    found = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
+    assert found.tried[len(found.scene)] <= 600 and 1 <= len(found.scene) <= 50
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".splat", ".glb", ".ply"])
+def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
+    scene = cloud(2000)
+    small = prune_scene(scene, PruneRequest(f"0.02MB{suffix}", "opacity")).scene
+    path = tmp_path / f"a{suffix}"
+    format_to_write(path).write(small, path, lambda what, share: None)
+    assert path.stat().st_size <= 20_000
+    assert len(small) < 2000 or suffix == ".sog"
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
+def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
+    full, limit = cloud(4000), FileLimit(format_to_write(suffix), 40_000)
+    found = {
+        psnr: largest_within(full, lambda count: full[:count], limit, lambda share: None, lambda scene, psnr=psnr: psnr)
+        for psnr in (25.0, 35.0)
+    }
+    assert found[25.0].limit.rounding.tolerance == pytest.approx(10**0.5 * found[35.0].limit.rounding.tolerance)
+    assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
+    for one in found.values():
+        small = one.limit.rounded(one.scene)
+        assert (
+            len(small) == len(one.scene) and 0.9 * 40_000 < one.limit.bytes_of(small) == one.tried[len(small)] <= 40_000
+        )
+
+
+def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():
+    scene, kind, usual = cloud(2000), format_to_write(".spz"), Rounding(0.002)
+    size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
+    for most in (int(0.9 * size), size, int(1.05 * size)):
+        found = FileLimit(kind, most, usual).bytes_of(FileLimit(kind, most, usual).rounded(scene))
+        assert 0.8 * most < found <= most
+    roomy = FileLimit(kind, int(1.5 * size), usual)
+    assert size < roomy.bytes_of(roomy.rounded(scene)) <= roomy.most
+
+
+def test_all_are_kept_unrounded_if_all_fit():
+    full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
+    found = largest_within(full, lambda count: full[:count], limit, lambda share: None)
+    assert found.scene is full and found.limit.rounded(full) is full
+    larger = cloud(3000, seed=1)  # as a repair may make one
+    tight = FileLimit(found.limit.kind, found.limit.bytes_of(larger) * 4 // 5)
+    assert tight.bytes_of(tight.rounded(larger)) <= tight.most

@@ -12,7 +12,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.compression import level_folder
-from pointsplat_ns.compression.level_errors import displacement, median_depth
+from pointsplat_ns.compression.level_errors import displacement
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning.merging import merge_levels
 
@@ -73,27 +73,6 @@ def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels, 
         assert torch.equal(levels.assignment(index - len(levels)), merged.assignment)
     with pytest.raises(IndexError):
         levels.assignment(4)
-
-
-def test_levels_are_nested(levels):
-    before = levels.assignment(0)
-    for index, level in enumerate(levels):
-        assert level.parents.dtype == torch.int32
-        assert len(level.parents) == (len(levels[index - 1].scene) if index else len(levels.dense))
-        kept = level.parents[level.parents >= 0]
-        assert sorted(set(kept.tolist())) == list(range(len(level.scene))), "every Gaussian has a child"
-        if index:
-            assert len(kept) == len(level.parents), "what is in a level is in all coarser ones"
-        after = levels.assignment(index)
-        for group in range(int(before.max()) + 1):
-            assert len(after[before == group].unique()) == 1, "what is one in a level stays one"
-        before = after
-
-
-def test_gaussians_too_faint_to_be_drawn_are_dropped_and_counted(levels):
-    for index, level in enumerate(levels):
-        assert level.dropped == 40 == int((levels.assignment(index) < 0).sum())
-    assert torch.equal((levels[0].parents < 0).nonzero()[:, 0], torch.arange(0, 400, 10))
 
 
 def test_the_manifest_is_true_of_the_files(folder, scene):
@@ -170,28 +149,8 @@ def test_errors_from_afar_are_against_the_mean_of_the_pixels_that_one_covers_the
             assert error["psnr"] == pytest.approx(psnr(((seen - wanted) ** 2).mean() / covered), abs=1e-4)
 
 
-def test_the_displacements_in_the_manifest_follow_from_the_files(folder):
-    manifest, dense = manifest_of(folder), ps.load(folder.parent / "ball.ply")
-    at = np.arange(len(dense))
-    for level in manifest["levels"]:
-        parents = np.load(folder / level["parents"]["file"])
-        at = np.where(at >= 0, parents[at], -1)
-        means = ps.load(folder / level["file"]).means.double()
-        moved = [float((dense.means[i].double() - means[k]).norm()) for i, k in enumerate(at) if k >= 0]
-        assert level["dropped"] == (at < 0).sum() == 40
-        assert level["displacement"]["rms"] == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=1e-9)
-        assert level["displacement"]["median"] == pytest.approx(np.median(moved), rel=1e-9)
-        assert level["displacement"]["p95"] == pytest.approx(np.percentile(moved, 95), rel=1e-9)
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-def test_a_scene_given_as_gaussians_has_no_file_in_the_manifest(levels, tmp_path):
-    levels.save(tmp_path / "out")
-    source = manifest_of(tmp_path / "out")["source"]
-    assert [source[key] for key in ("file", "bytes", "sha256", "count", "sh_degree")] == [None, None, None, 400, 1]
 
 
 @pytest.mark.parametrize("where", [(DenseReference, "closeness"), (level_folder, "write_ply"), (level_folder, "_draw")])
@@ -279,26 +238,6 @@ def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, 
     assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
     assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
-
-
-def test_the_distance_is_that_of_what_is_seen():
-    rows = torch.linspace(-3, 3, 40)
-    places = torch.cartesian_prod(rows, rows)
-    n = len(places)
-    wall = ps.Gaussians(
-        means=torch.cat([places, torch.full((n, 1), 2.5)], dim=1),
-        scales=torch.tensor([0.15, 0.15, 1e-3]).log().repeat(n, 1),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        opacities=torch.full((n, 1), 5.0),
-        features_dc=torch.zeros(n, 3),
-        features_rest=torch.zeros(n, 0, 3),
-    )
-    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
-    ahead = ps.Views(torch.eye(4)[None], K[None], 64, 48, torch.zeros(3))
-    assert median_depth(wall, DenseReference(wall, ahead)) == pytest.approx(2.5, abs=1e-4)
-    behind = ps.Views(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None], K[None], 64, 48, torch.zeros(3))
-    assert median_depth(wall, DenseReference(wall, behind)) is None
-    assert ps.lod(wall, ["50%"], views=ahead).distance == pytest.approx(2.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])

@@ -9,10 +9,9 @@ import torch
 import pointsplat_ns as ps
 from making import FewViews
 from pointsplat_ns.compression import photo_repair as module
-from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.optimiser import Example, gradients_of
 from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair
-from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, RepairBudget
+from pointsplat_ns.compression.requests import PHOTO_STEPS, PhotoBudget
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import prune
@@ -78,11 +77,6 @@ def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
     assert trained.interrupted and trained.steps == 25 and trained.after > trained.before + 0.5
 
 
-def test_seconds_end_it(hollow_ball, pruned, photos):
-    trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget(seconds=0.3))
-    assert trained.steps >= 1 and trained.seconds >= 0.3
-
-
 def test_one_photo_is_too_few(hollow_ball, pruned, photos):
     with pytest.raises(DataError, match="1 photos to train on; expected at least two"):
         photo_repair(pruned, hollow_ball, photos[:1], FewViews(hollow_ball), PhotoBudget("quick"))
@@ -110,22 +104,6 @@ def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert any(float(value.abs().max()) > 0 for value in first.values())
     assert module._psnr(pruned, wrong, [0, 8]) == module._psnr(pruned, right, [0, 8])
-
-
-def test_compact_says_what_photos_brought(hollow_ball, photos):
-    request = CompactRequest.of(keep=0.2, repair=RepairBudget("quick"), photos=True)
-    request = dataclasses.replace(request, repair=RepairBudget("instant"))
-    result = compact_scene(hollow_ball, request, FewViews(hollow_ball, resolution=(64, 48)), photos=photos)
-    assert result.last.name == "photos" and result.photo_psnr == result.last.photos.after
-    assert "trained on 15 photos by 40 steps in" in result.verdict
-    assert "dB PSNR in 3 photos that no step used" in result.verdict
-    assert len(result.scene) == 300
-
-
-def test_a_number_of_seconds_is_for_the_photos():
-    request = CompactRequest.of(repair=RepairBudget(seconds=60), photos=True)
-    assert request.repair == RepairBudget("quick") and request.photos == PhotoBudget(seconds=60)
-    assert CompactRequest.of(repair=RepairBudget(seconds=60)).photos is None
 
 
 def test_a_run_is_compacted_with_its_photos(trained_walls):

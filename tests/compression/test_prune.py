@@ -1,23 +1,28 @@
-"""From what a person asks for to a smaller scene: what is combined, what is noted, what is refused."""
+"""Pruning files, and streamed levels."""
 
 import dataclasses
+import json
 import math
 
 import pytest
 import torch
 
+import pointsplat_ns as ps
 from making import ball, box_room, same
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression.level_stream import Chunks, Node, partition
 from pointsplat_ns.compression.pictures import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
-from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning import METHODS, Keep, Megabytes, WithinPsnr, cut_sh, ply_bytes, prune, select
+from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
@@ -38,19 +43,6 @@ def pruned(
     """Pruned with renders compared in the given views."""
     source = ViewSource(scene, given=views) if isinstance(views, Views) else views
     return prune_scene(scene, PruneRequest(keep, by, **options), source, progress)
-
-
-class Refusing(ViewSource):
-    """Views that must not be asked for."""
-
-    def views(self, count: int) -> Views:
-        raise AssertionError("views were asked for")
-
-
-def test_no_views_are_asked_for_where_none_are_needed(scene):
-    result = pruned(scene, Refusing(scene), 0.25, "coverage", sh="0")
-    assert same(result.scene, cut_sh(prune(scene, 0.25, "coverage"), 0))
-    assert result.notes == ("SH degree 1 cut to 0: 100 % of what SH add to colours is lost",)
 
 
 @pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if method.needs_views))
@@ -74,29 +66,9 @@ def test_a_psnr_for_a_format_is_reached_by_its_rounded_scene_in_fewer_bytes(scen
     assert DenseReference(scene, views).psnr(small)[0] >= 22.0
 
 
-def test_a_size_counts_the_bands_that_are_left(scene):
-    result = pruned(scene, None, Megabytes(0.01), "opacity", sh="0")
-    assert ply_bytes(len(result.scene), 0) <= 10_000 < ply_bytes(len(result.scene) + 1, 0)
-
-
-@pytest.mark.parametrize("sh", ["0", "auto"])
-def test_a_size_that_only_fits_without_bands_is_no_reason_to_refuse(sh, scene, views):
-    faint = scene.replace(features_rest=scene.features_rest * 1e-3)
-    size = Megabytes(ply_bytes(1, 0) / 1e6)
-    with pytest.raises(BudgetError, match="too small for one Gaussian of SH degree 1"):
-        pruned(faint, views, size, "opacity")
-    assert len(pruned(faint, views, size, "opacity", sh=sh).scene) == 1
-
-
 @pytest.mark.parametrize("by", sorted(name for name, method in METHODS.items() if method.needs_views))
 def test_a_scene_without_directional_bands_can_be_looked_at(by, scene, views):
     assert len(pruned(scene, views, 0.25, by, sh="0").scene) == 100
-
-
-def test_an_auto_budget_is_measured_against_the_scene_with_all_its_bands(scene, views):
-    result = pruned(scene, views, WithinPsnr(22.0), "coverage", sh="0")
-    assert result.scene.sh_degree == 0 and DenseReference(scene, views).psnr(result.scene)[0] >= 22
-    assert any("dB PSNR against the dense scene" in note and "3 views" in note for note in result.notes)
 
 
 def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, views):
@@ -106,33 +78,6 @@ def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, v
     result = pruned(strong, views, 1.0, "paper", sh="auto")
     assert result.scene.sh_degree == 1
     assert result.notes == ("views: given views", "SH degree 1 kept")
-
-
-def test_fine_tuning_follows_where_it_is_asked_for(scene, views):
-    plain = pruned(scene, None, 0.3, "coverage").scene
-    tuned = pruned(scene, views, 0.3, "coverage", fine_tune=10).scene
-    reference = DenseReference(scene, views)
-    assert len(tuned) == len(plain) and reference.psnr(tuned)[0] > reference.psnr(plain)[0]
-
-
-def test_progress_names_what_is_done(scene, views):
-    steps = []
-    report = lambda what, share: steps.append((what, share))  # noqa: E731
-    pruned(scene, views, WithinPsnr(20.0), "lightgaussian", report, sh="auto", fine_tune=2)
-    assert all(0 <= share <= 1 for _, share in steps)
-    assert list(dict.fromkeys(what for what, _ in steps)) == [
-        "comparing SH degrees",
-        "by lightgaussian",
-        "trying counts",
-        "fine-tuning",
-    ]
-
-
-@pytest.mark.parametrize("by", METHODS)
-@pytest.mark.parametrize("keep", [0, 0.0, 1.5, math.nan, 401, -1, Megabytes(1e-6), WithinPsnr(math.nan)])
-def test_what_cannot_be_made_is_refused_by_every_method_before_it_looks(by, keep, scene):
-    with pytest.raises(BudgetError):
-        pruned(scene, Refusing(scene), keep, by)
 
 
 def test_what_is_no_scene_is_refused(scene):
@@ -166,11 +111,6 @@ def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
         assert (tmp_path / f"{i}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_merging_looks_from_the_views_that_are_given_and_from_no_others(scene, views):
-    given = pruned(scene, views, 30).scene
-    assert same(given, prune(scene, 30, views=views)) and not same(given, prune(scene, 30))
-
-
 def test_merging_stands_upright_in_views_that_are_sampled_for_it():
     scene = box_room(0, 3000)
     source = ViewSource(scene, resolution=(64, 48), up=up_named("x"))
@@ -178,3 +118,78 @@ def test_merging_stands_upright_in_views_that_are_sampled_for_it():
     assert looked is not None and (looked.width, looked.height) == (64, 48)
     level = looked.viewmats[:, 0, :3] @ source.up.direction  # no camera is rolled about its axis
     assert float(level.abs().max()) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def levels() -> ps.Levels:
+    """Of a ball of which one Gaussian in ten is too faint to be drawn. Shared, so do not write to it."""
+    scene = ball(400, opacity=1.0, bright=1.0)
+    scene.opacities[::10] = -9.0
+    return ps.lod(scene, ["100%", "50%", "10%"], views=ps.sample_views(scene, 2, 32, 24))
+
+
+def leaves_of(node: Node) -> list[Node]:
+    return [leaf for child in node.children for leaf in leaves_of(child)] if node.children else [node]
+
+
+def parents_of(levels: ps.Levels) -> list[torch.Tensor]:
+    return [level.parents.long() for level in levels.levels[1:]]
+
+
+def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(levels):
+    parents = parents_of(levels)
+    leaves = leaves_of(partition(levels.scenes, parents, Chunks(100)))
+    assert len(leaves) > 3
+    for index, scene in enumerate(levels.scenes):
+        rows = torch.cat([leaf.rows[index] for leaf in leaves])
+        kept = torch.arange(len(scene)) if index else (parents[0] >= 0).nonzero()[:, 0]
+        assert torch.equal(rows.sort().values, kept)
+    for leaf in leaves:
+        for finer, coarser, of in zip(leaf.rows, leaf.rows[1:], parents, strict=False):
+            assert set(of[finer].tolist()) == set(coarser.tolist()), "no gap and nothing twice between levels"
+
+
+def test_leaves_have_at_most_as_many_gaussians_as_asked_for(levels):
+    parents = parents_of(levels)
+    largest = int(torch.bincount(parents[1][parents[0][parents[0] >= 0]]).max())  # one family is not cut
+    leaves = leaves_of(partition(levels.scenes, parents, Chunks(50)))
+    assert max(len(leaf.rows[0]) for leaf in leaves) <= max(50, largest)
+    assert len(leaves_of(partition(levels.scenes, parents, Chunks(400)))) == 1
+
+
+def test_wide_leaves_of_many_gaussians_are_cut(levels):
+    leaves = leaves_of(partition(levels.scenes, parents_of(levels), Chunks(extent=0.5, least=40)))
+    for leaf in leaves:
+        means = levels[-1].scene.means[leaf.rows[-1]]
+        assert len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5
+    assert len(leaves) > 3
+
+
+@pytest.mark.parametrize("sizes", [{"count": 0}, {"extent": 0.0}, {"extent": float("nan")}])
+def test_sizes_are_positive(sizes):
+    with pytest.raises(ps.BudgetError, match="positive"):
+        Chunks(**sizes)
+
+
+def test_the_command_writes_the_scene_and_its_levels(tmp_path, capsys):
+    ps.save(ball(400, opacity=1.0, bright=1.0), tmp_path / "room.ply")
+    arguments = ["lod", str(tmp_path / "room.ply"), "--stream", "--levels", "25%", "50%"]
+    main(arguments)
+    folder = tmp_path / "room_stream"
+    assert "level_2" in capsys.readouterr().out and not (folder / "lod.json").exists()
+    assert json.loads((folder / "lod-meta.json").read_text())["counts"] == [400, 200, 100]
+    assert [len(read_sog_stream(folder, level)) for level in range(3)] == [400, 200, 100]
+    main(["convert", str(folder), str(tmp_path / "finest.ply")])
+    assert len(ps.load(tmp_path / "finest.ply")) == 400
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "exists already" in capsys.readouterr().err
+    main([*arguments, "--force", "--json"])
+    assert [level["count"] for level in json.loads(capsys.readouterr().out)["levels"]] == [400, 200, 100]
+
+
+def test_fine_tuning_follows_where_it_is_asked_for(scene, views):
+    plain = pruned(scene, None, 0.3, "coverage").scene
+    tuned = pruned(scene, views, 0.3, "coverage", fine_tune=10).scene
+    reference = DenseReference(scene, views)
+    assert len(tuned) == len(plain) and reference.psnr(tuned)[0] > reference.psnr(plain)[0]

@@ -41,27 +41,6 @@ def test_quaternions_of_rotation_matrices_are_those_that_made_them_or_their_nega
     torch.testing.assert_close(found * alike.sign()[:, None], quats, rtol=0, atol=1e-9)  # as far as the real parts go
 
 
-def test_both_layouts_hold_the_same_matrices():
-    unit = torch.nn.functional.normalize(random_quats(), dim=1)
-    found = rotation_components(unit.T.contiguous()).permute(2, 0, 1)
-    torch.testing.assert_close(found, rotation_matrices(unit), rtol=0, atol=1e-14)  # it normalises once more
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_zero_quaternion_is_the_identity(dtype):
-    zero = torch.zeros(1, 4, dtype=dtype)
-    assert torch.equal(rotation_matrices(zero)[0], torch.eye(3, dtype=dtype))
-    assert torch.equal(rotation_components(zero.T)[..., 0], torch.eye(3, dtype=dtype))
-    assert zero_as_identity(zero).tolist() == [[1.0, 0.0, 0.0, 0.0]]
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_shorter_than_the_shortest_is_the_identity_in_any_precision(dtype):
-    short = torch.tensor([[0, 0, 0, length] for length in (0.0, 1e-320, 1e-40, 1.16e-38)], dtype=dtype)
-    assert torch.equal(rotation_matrices(short), torch.eye(3, dtype=dtype).expand(4, 3, 3))
-    assert zero_as_identity(short).tolist() == [[1.0, 0.0, 0.0, 0.0]] * 4
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("length", [SHORTEST, 1e-30, 1e-20, 1e30])
 def test_the_shortest_and_longer_turn_as_those_of_length_one(length, dtype):
@@ -115,10 +94,6 @@ def test_other_quaternions_stay_as_they_are_to_the_bit():
     quats = random_quats()
     quats[3, 1:] = 0.0
     assert torch.equal(zero_as_identity(quats), quats)
-
-
-def test_no_quaternions_have_no_matrices():
-    assert rotation_matrices(torch.empty(0, 4)).shape == (0, 3, 3)
 
 
 def test_the_rasterizer_draws_short_quaternions_in_float32_as_in_float64():

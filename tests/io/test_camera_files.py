@@ -5,7 +5,6 @@ import math
 import os
 import struct
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
-from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry, transforms_beside
+from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry
 from pointsplat_ns.io.camera_files.cameras import CameraLimits
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, written
 
@@ -26,16 +25,13 @@ IDENTITY = torch.eye(4).tolist()
 def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
     """Cameras that stand and look anywhere."""
     generator = torch.Generator().manual_seed(SEED)
-    matrices = torch.cat(
-        [
-            rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64)),
-            torch.randn(count, 3, 1, generator=generator, dtype=torch.float64),
-        ],
-        dim=2,
-    )
+    turns = rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64))
+    places = torch.randn(count, 3, 1, generator=generator, dtype=torch.float64)
     cx, cy = (width / 2, height / 2) if centred else (30.5, 25.25)
     K = torch.tensor([[50.0, 0, cx], [0, 52.0, cy], [0, 0, 1]], dtype=torch.float64)
-    return ps.Views(invert_rigid(matrices), K.repeat(count, 1, 1), width, height, torch.zeros(3))
+    return ps.Views(
+        invert_rigid(torch.cat([turns, places], dim=2)), K.repeat(count, 1, 1), width, height, torch.zeros(3)
+    )
 
 
 def need_same(found: ps.Views, expected: ps.Views, within: float = 1e-9) -> None:
@@ -89,12 +85,6 @@ def test_a_camera_of_3dgs_looks_along_its_third_column(tmp_path):
     torch.testing.assert_close((view.viewmat @ below)[:3], torch.tensor([0.0, 1.0, 2.0]).double())
 
 
-def test_a_camera_of_nerfstudio_looks_along_its_negative_third_column(tmp_path):
-    view = read_views(written(framed(transform_matrix=IDENTITY), tmp_path / "transforms.json"))[0]
-    above = torch.tensor([0.0, 1.0, -2.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close((view.viewmat @ above)[:3], torch.tensor([0.0, -1.0, 2.0]).double())
-
-
 def test_colmap_models_are_what_nerfstudio_reads(tmp_path):
     utils = pytest.importorskip("nerfstudio.data.utils.colmap_parsing_utils")
     for folder, suffix in ((write_colmap_text(some_views(), tmp_path / "a"), "text"),
@@ -134,36 +124,11 @@ def moved_as(transform: torch.Tensor, scale: float) -> str:
 TURN = torch.tensor([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kind", WRITERS)
-@pytest.mark.parametrize("beside", [True, False])
-def test_transforms_move_poses_of_datasets_but_not_those_of_3dgs(kind, beside, tmp_path):
-    views = some_views(centred=kind == "inria")
-    path = WRITERS[kind](views, tmp_path)
-    if not beside:
-        (tmp_path / "elsewhere").mkdir()
-    place = tmp_path / ("" if beside else "elsewhere") / "dataparser_transforms.json"
-    place.write_text(moved_as(TURN, 0.25))
-    assert transforms_beside(path) == (place if beside else None)
-    poses = invert_rigid(views.viewmats)
-    if kind != "inria":
-        poses = torch.cat([TURN, torch.tensor([[0.0, 0, 0, 1]])]).double() @ poses
-        poses[:, :3, 3] *= 0.25
-    need_same(read_views(path, None if beside else place), replace(views, viewmats=invert_rigid(poses)))
-
-
 def test_transforms_that_are_no_rigid_motion_are_refused(tmp_path):
     path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
     (tmp_path / "dataparser_transforms.json").write_text(moved_as(2 * TURN, 1.0))
     with pytest.raises(ps.DataError, match=r"dataparser_transforms.json: its transform is no rigid motion"):
         read_views(path)
-
-
-def test_intrinsics_may_stand_in_each_frame(tmp_path):
-    content = nerfstudio(some_views(2))
-    for index, frame in enumerate(content["frames"]):
-        frame.update(fl_x=40.0 + index, cx=10.0 + index)
-    found = read_views(written(without(content, "fl_x"), tmp_path / "transforms.json"))
-    assert found.Ks[:, 0, 0].tolist() == [40.0, 41.0] and found.Ks[:, 0, 2].tolist() == [10.0, 11.0]
 
 
 @pytest.mark.parametrize(("photo", "size"), [(None, (800, 800)), ("a.png", (60, 40)), ("broken", (800, 800))])
@@ -239,20 +204,6 @@ def test_focal_lengths_and_principal_point_of_each_model_of_colmap(model, params
     assert K.diagonal()[:2].tolist() == [*focal] and K[:2, 2].tolist() == [*centre]
 
 
-def test_the_folder_of_a_colmap_model_may_be_named_by_its_files_and_have_both_kinds(tmp_path):
-    folder = write_colmap_text(some_views(2), tmp_path)
-    write_colmap_binary(some_views(), folder)
-    for name in ("", "images.bin", "cameras.txt"):
-        assert len(read_views(folder / name)) == 12
-
-
-def test_views_are_in_the_order_of_names_with_numbers_by_size(tmp_path):
-    views = some_views()
-    content = nerfstudio(views)
-    content["frames"].sort(key=lambda frame: frame["file_path"])  # frame_10 comes before frame_2
-    need_same(read_views(written(content, tmp_path / "transforms.json")), views)
-
-
 def test_cameras_of_other_sizes_see_the_same_at_the_most_common_size(tmp_path):
     content = inria(some_views(3, centred=True))
     content[1].update(width=128, height=24, fx=100.0, fy=26.0)
@@ -270,35 +221,21 @@ def inria_with(**changes) -> list:
         ("{", "cannot be read as JSON"),
         ("[" * 100_000, "cannot be read as JSON"),
         ('{"frames": ' + "[" * 100_000, "cannot be read as JSON"),
-        ("3", "JSON without a list of cameras"),
         ({}, "JSON without a list of cameras"),
         ({"camera_path": []}, "a camera path of nerfstudio's viewer, for `render --path`"),
         ([], "0 cameras; expected 1 to 100000"),
-        ({"frames": []}, "0 cameras; expected 1 to 100000"),
         ([3], "camera 0 has no pose"),
         (inria_with(position=[1, 2]), "camera 1 has no pose"),
-        (inria_with(rotation=[[1, 0], [0, 1]]), "camera 1 has no pose"),
-        (inria_with(position=[math.nan, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
-        (inria_with(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), r"the pose of camera 1 (.*)?is no rigid motion"),
-        (inria_with(fx=math.inf), "camera 1 has no intrinsics"),
-        (inria_with(fx=0), "camera 1 .* has no usable focal length"),
         (inria_with(fx=1e12), "camera 1 .* has no usable focal length"),
-        (inria_with(width=0), "camera 1 .* has a picture of no usable size"),
         (inria_with(height=10**7), "camera 1 .* has a picture of no usable size"),
         ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
-        (framed(transform_matrix=None), "camera 0 has no pose"),
-        (framed(transform_matrix=[[1, 2, 3]] * 4), "camera 0 has no pose"),
         (turned(0, 3, math.inf), r"the pose of camera 0 (.*)?is no rigid motion"),
-        (turned(3, 3, 2.0), r"the pose of camera 0 (.*)?is no rigid motion"),
-        (framed(fl_x=0), "camera 0 has no focal length"),
         (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
         (framed(camera_model="EQUIRECTANGULAR"), "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE"),
-        (framed(camera_model=[1]), r"camera 0 is '\[1\]'"),
         ({**framed(), "applied_transform": [[1, 2]]}, "its 'applied_transform' or 'applied_scale' is not usable"),
-        ({**framed(), "applied_scale": 0}, "its 'applied_transform' or 'applied_scale' is not usable"),
         ({**framed(), "applied_transform": [[0, 0, 0, 0]] * 3}, "its 'applied_transform' is no rigid motion"),
         (without(framed(), "fl_x", "fl_y"), "camera 0 has no focal length"),
     ],
@@ -355,25 +292,18 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
         (colmap_texts("3 PINHOLE 64 48 50 50 30\n"), "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera"),
         (colmap_texts("3 EQUIRECTANGULAR 64 48 64 48\n"), "a camera of model EQUIRECTANGULAR; expected one of SIMPLE"),
         (colmap_texts("4 PINHOLE 64 48 50 50 30 20\n"), "frame_0.png was taken by camera 3, which cameras.txt lacks"),
-        (colmap_texts("3 PINHOLE 64 48 nan 50 30 20\n"), "camera 0 .frame_0.png. has no usable focal length"),
-        (colmap_texts(None, "# nothing\n"), "images.txt: 0 cameras"),
         (colmap_texts(None, "1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
         (colmap_texts(None, "1 0 0 0 0 0 0 0 3 a.png\n\n"), "the pose of camera 0 .a.png. is no rigid motion"),
-        (colmap_texts(None, "1 1 0 0 0 inf 0 0 3 a.png\n\n"), "the pose of camera 0 .a.png. is no rigid motion"),
         (colmap_texts(None, "1 1 0 0 0 0 0 0 3 " + "a" * 10_000), "a line of more than 4096 bytes"),
         (colmap_bytes(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
-        (colmap_bytes(0, struct.pack("<Q", 0)), "images.bin: says that it has 0 entries"),
-        (colmap_bytes(0, struct.pack("<Q", 2**63), "cameras.bin"), "cameras.bin: says that it has"),
         (colmap_bytes(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
         (colmap_bytes(8 + 60, struct.pack("<I", 9)), "was taken by camera 9"),
         (colmap_bytes(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
-        (colmap_bytes(12, struct.pack("<i", 11), "cameras.bin"), "cameras.bin: ends too early"),
         (colmap_bytes(12, struct.pack("<i", -1), "cameras.bin"), "a camera of model -1; expected one of SIMPLE"),
         (colmap_bytes(16, struct.pack("<Q", 2**64 - 1), "cameras.bin"), "has a picture of no usable size"),
         (colmap_bytes(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
         (cut("images.bin", 0), "images.bin: ends too early"),
         (cut("images.bin", NAME_AT + 3), r"images.bin: says that it has 2 entries and has room for 0"),
-        (cut("images.bin", 170), "images.bin: (ends too early|no end of an image's name)"),
     ],
 )
 def test_damaged_colmap_models_are_refused_in_one_line(write, message, tmp_path):
@@ -418,11 +348,3 @@ def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypa
     monkeypatch.setattr(registry, "CAMERA_LIMITS", CameraLimits(file_bytes=10))
     with pytest.raises(ps.DataError, match="expected cameras of at most"):
         read_views(path)
-
-
-@pytest.mark.parametrize("name", ["room.ply", "a.ckpt", "config.yml", "meta.json", "room.sog"])
-def test_scenes_and_runs_are_no_files_of_cameras(name, tmp_path):
-    (tmp_path / name).touch()
-    assert not is_camera_file(tmp_path / name)
-    if name in ("config.yml", "meta.json"):
-        assert not is_camera_file(tmp_path)

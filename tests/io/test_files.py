@@ -1,29 +1,21 @@
-"""What every reader and writer does with a path."""
+"""Files: found, opened and replaced."""
 
-import errno
 import hashlib
 import os
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
+import pointsplat_ns as ps
+from making import cloud, normal_scene
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import content_hash
+from pointsplat_ns.io import read_scene, write_ply
+from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import replacing
-
-
-def test_content_hash_is_the_sha256_of_all_bytes(tmp_path):
-    data = bytes(range(256)) * 10_000  # 2.56 MB: read in three pieces
-    (tmp_path / "a.ply").write_bytes(data)
-    assert content_hash(tmp_path / "a.ply") == hashlib.sha256(data).hexdigest()
-
-
-def test_content_hash_of_no_file_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="no such file"):
-        content_hash(tmp_path / "none.ply")
-    with pytest.raises(SceneError, match="not a regular file"):
-        content_hash(tmp_path)
+from pointsplat_ns.io.scene import save
+from pointsplat_ns.io.source import source_file
 
 
 def write(path: Path, text: str = "new") -> None:
@@ -31,28 +23,11 @@ def write(path: Path, text: str = "new") -> None:
         part.write_text(text)
 
 
-@pytest.mark.parametrize("name", ["x" * 251 + ".ply", "\u00e9" * 125 + ".ply", "x" * 243, "x" * 244])
-def test_every_name_that_the_file_system_takes_can_be_written(tmp_path, name):
-    write(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-    assert (tmp_path / name).read_text() == "new"
-
-
 @pytest.mark.parametrize("name", ["x" * 256, "x" * 300 + "/a.ply", "\u00e9" * 128])
 def test_a_name_that_is_too_long_is_the_error_that_is_told(tmp_path, name):
     with pytest.raises(SceneError, match=r"cannot be written \(File name too long\)"):
         write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_read_only_file_system_is_the_error_that_is_told(tmp_path, monkeypatch):
-    def refused(*_, **__):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(Path, "write_text", refused)
-    monkeypatch.setattr(Path, "unlink", refused)
-    with pytest.raises(SceneError, match=r"a.ply: cannot be written \(Read-only file system\)"):
-        write(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("path", ["/proc/a.ply", "/dev/null/a.ply", "/dev/null", "file/a.ply", "nul\0/a.ply"])
@@ -79,15 +54,6 @@ def test_output_through_a_link_is_written_to_its_target(tmp_path, relative):
     assert link.is_symlink() and target.read_text() == "anew", "a link that led nowhere"
 
 
-def test_links_in_a_circle_are_refused_and_stay(tmp_path):
-    one, other = tmp_path / "one", tmp_path / "other"
-    one.symlink_to(other)
-    other.symlink_to(one)
-    with pytest.raises(SceneError, match="one|other"):
-        write(one)
-    assert one.is_symlink() and other.is_symlink()
-
-
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o755])
 def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
     path = tmp_path / "a.ply"
@@ -99,12 +65,6 @@ def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
     assert path.read_text() == "new" and stat.S_IMODE(path.stat().st_mode) == mode
 
 
-def test_a_new_file_has_the_mode_of_any_new_file(tmp_path):
-    (tmp_path / "any").touch()
-    write(tmp_path / "a.ply")
-    assert (tmp_path / "a.ply").stat().st_mode == (tmp_path / "any").stat().st_mode
-
-
 def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.ply"
     path.write_text("old")
@@ -112,3 +72,85 @@ def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
         part.write_text("half")
         raise KeyError
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_of_a_file_it_is_the_hash_of_its_bytes(tmp_path):
+    path = tmp_path / "room.ply"
+    ps.save(normal_scene(5), path)
+    source = source_file(path)
+    data = path.read_bytes()
+    assert (source.name, source.bytes, source.sha256) == ("room.ply", len(data), hashlib.sha256(data).hexdigest())
+
+
+def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
+    folder = tmp_path / "room"
+    ps.save(normal_scene(5), folder / "meta.json")
+    source = source_file(folder)
+    assert source.name == "room" and source == source_file(folder / "meta.json")
+    assert source.bytes == sum(part.stat().st_size for part in folder.iterdir())
+    shutil.copytree(folder, tmp_path / "copy")
+    assert source_file(tmp_path / "copy").sha256 == source.sha256
+    (folder / "notes.txt").write_text("not of the scene")
+    assert source_file(folder) == source
+    image = folder / "means_l.webp"
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert source_file(folder).sha256 != source.sha256
+
+
+@pytest.mark.parametrize("name", ["missing.ply", "missing"])
+def test_what_is_not_there_is_one_error(tmp_path, name):
+    with pytest.raises(ps.SceneError, match=name):
+        source_file(tmp_path / name)
+
+
+POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+
+
+def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else_is(make_run, tmp_path, caplog):
+    folder = tmp_path / "outputs"
+    make_run("kitchen", time="2024-05-06_070809", steps=(9,))
+    newest = make_run("kitchen", method="splatfacto-cpu", time="2025-05-06_070809", steps=(19,))
+    make_run("of-another-kind", method="nerfacto")
+    write_ply(cloud(3), newest / "compact.ply")  # in the folder of a run
+    for name in ("hall.ply", "deep/er/HALL.PLY", "kitchen.ply", ".hidden/x.ply", "made/y.ply"):
+        write_ply(cloud(3), folder / name)
+    (folder / "made" / FOLDER_FILES.scenes).touch()
+    (folder / "points.ply").write_bytes(POINTS)
+    (folder / "notes.txt").touch()
+    found = {scene.name: scene.path for scene in find_scenes(folder)}
+    assert found == {
+        "deep/er/HALL": folder / "deep/er/HALL.PLY",
+        "hall": folder / "hall.ply",
+        "kitchen": newest,
+        "kitchen_ply": folder / "kitchen.ply",
+    }
+    assert all(len(read_scene(path)) > 0 for path in found.values())
+    assert "passed over" in caplog.text and "points.ply" in caplog.text
+
+
+def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder, said in (
+        (make_run(), "expected a folder with scenes below it"),
+        (tmp_path / "gone", "expected a folder with scenes below it"),
+        (tmp_path / "empty", "no scene below it; expected files \\(.*\\) or trained Splatfacto runs"),
+    ):
+        with pytest.raises(SceneError, match=said):
+            find_scenes(folder)
+
+
+def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
+    made = ("room_pruned.ply", "room_compact.spz", "room_lod/level_0.ply", "room_tradeoff/room_10pct.ply")
+    for name in ("room.sog", "other_compact.ply", "deep/room_pruned.ply", *made):
+        save(cloud(50, 0, 1), tmp_path / name)
+    (tmp_path / "room_lod" / "lod.json").touch()
+    (tmp_path / "room_tradeoff" / "tradeoff.json").touch()
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
+    assert f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text
+
+
+def test_a_run_is_named_by_its_experiment_wherever_the_search_begins(make_run, tmp_path):
+    run = make_run("kitchen")
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["outputs/kitchen"]
+    for folder in (run.parent, run.parents[1]):
+        assert [scene.name for scene in find_scenes(folder)] == ["kitchen"]

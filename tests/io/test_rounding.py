@@ -1,4 +1,4 @@
-"""Numbers rounded where the error shows least."""
+"""Rounding, rows and palettes."""
 
 import math
 
@@ -6,10 +6,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import cloud
+from making import cloud, same_bits
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import ply, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded, rounding_for, steps_of, weights
+from pointsplat_ns.io.formats.palette import codebook, palette
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
 from pointsplat_ns.rasterizer import render
@@ -44,15 +47,6 @@ def test_the_tolerance_is_a_share_of_the_error_that_there_is(psnr):
     assert rounding_for(psnr).tolerance == pytest.approx(ROUNDING.share * 10 ** (-min(psnr, 45.0) / 20))
 
 
-@pytest.mark.parametrize("step", [1e-300, 1e-9, 0.3, 7.0, 1e30])
-def test_multiples_of_a_power_of_two(step):
-    values = torch.tensor([0.0, 1e-20, 0.3, -7.9, 1e9], dtype=torch.float64)
-    result = multiples(values, torch.tensor(step, dtype=torch.float64))
-    power = 2.0 ** math.floor(math.log2(min(max(step, 2.0**-60), 2.0**60)))
-    assert bool((result - values).abs().le(power / 2 + 1e-12 * values.abs()).all())
-    assert torch.equal((result / power).round() * power, result)
-
-
 @pytest.mark.parametrize(
     ("name", "change"), [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])]
 )
@@ -63,13 +57,6 @@ def test_a_step_changes_a_gaussian_by_its_tolerance_over_the_contrast(name, chan
     changed = scene.replace(**{name: getattr(scene, name) + error.float() * torch.tensor([change])})
     relative = float((values(changed) - values(scene)).norm() / values(scene).norm())
     assert relative == pytest.approx(tolerance / ROUNDING.contrast, rel=0.02)
-
-
-def test_large_opaque_gaussians_count_more():
-    scene = cloud(100)
-    alone = weights(scene.replace(scales=scene.scales + torch.linspace(0, 2, 100)[:, None]))
-    assert float(alone[-1] / alone[0]) > float(weights(scene)[-1] / weights(scene)[0])
-    assert float(weights(scene).log().mean()) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_extremes_stay_finite_and_usable():
@@ -86,16 +73,6 @@ def test_extremes_stay_finite_and_usable():
         for tolerance in (1e-12, 0.01, 1.0, 1e6):
             small = format_to_write(suffix).rounded(scene, Rounding(tolerance))
             assert len(small) == 6 and bool(small.usable().all()), (suffix, tolerance)
-
-
-@pytest.mark.parametrize("suffix", [".spz", ".sog"])
-def test_no_tolerance_changes_nothing_and_a_small_one_little(suffix):
-    scene, kind = cloud(300), format_to_write(suffix)
-    assert kind.rounded(scene, Rounding(0.0)) is scene
-    assert len(kind.rounded(scene[:0], Rounding(0.1))) == 0
-    near = kind.rounded(scene, Rounding(1e-9))
-    assert torch.allclose(near.means, scene.means, atol=1e-3)  # SOG's own steps
-    assert torch.allclose(near.alphas, scene.alphas, atol=1 / 255)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
@@ -124,3 +101,68 @@ def test_a_tolerance_beats_fewer_bits_for_all(tmp_path):
     size, error = written(encode_spz(room, sh_bits=(3, 3)))
     smaller, less = written(encode_spz(rounded(room, Rounding(0.01))))
     assert smaller < size and less < error
+
+
+def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
+    scene = cloud(50, seed=3, sh_degree=1)
+    table = ply.row_table(scene).astype(">f8")
+    names = [line.split()[2] for line in ply.header_bytes(50, 1).decode().splitlines() if line.startswith("property")]
+    turned = [names.index(name) for name in reversed(names)]
+    lines = ["ply", "format binary_big_endian 1.0", "element camera 2", "property uchar id", "element vertex 50"]
+    header = "\n".join([*lines, *(f"property double {names[i]}" for i in turned), "end_header", ""]).encode()
+    (tmp_path / "a.ply").write_bytes(header + b"ab" + table[:, turned].tobytes())
+    rows = ply.PlyRows.open(tmp_path / "a.ply")
+    assert rows is not None and (len(rows), rows.sh_degree) == (50, 1)
+    assert same_bits(ps.Gaussians.cat([rows.read(0, 20), rows.read(20, 50)]), scene)
+    assert same_bits(rows.pick([49, 3]), scene[[49, 3]])
+    assert same_bits(read_ply(tmp_path / "a.ply"), scene)
+
+
+def test_rows_are_refused_as_whole_files_are_and_when_a_file_shrinks(tmp_path):
+    write_ply(cloud(50), tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    rows = ply.PlyRows.open(tmp_path / "a.ply")
+    assert rows is not None
+    (tmp_path / "a.ply").write_bytes(data[:-9])
+    with pytest.raises(SceneError, match="truncated while it was read; expected 50 Gaussians"):
+        rows.read(40, 50)
+    with pytest.raises(SceneError, match="declares 50 Gaussians of .* the file holds 49"):
+        ply.PlyRows.open(tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 50", b"vertex 1000000000000000"))
+    with pytest.raises(SceneError, match="declares 1000000000000000 Gaussians"):
+        ply.PlyRows.open(tmp_path / "a.ply")
+    with pytest.raises(SceneError, match="no such file"):
+        ply.PlyRows.open(tmp_path / "b.ply")
+
+
+def rows_of(n, dims, seed=0):
+    """Rows about 300 centres, as real SH are about few."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.randn(300, dims, generator=generator)
+    return centres[torch.randint(300, (n,), generator=generator)] + 0.01 * torch.randn(n, dims, generator=generator)
+
+
+@pytest.mark.parametrize("values", [torch.zeros(5), torch.tensor([1.0]), torch.linspace(-3, 3, 256)])
+def test_a_codebook_of_few_numbers_is_exact(values):
+    book, index = codebook(values)
+    assert book.shape == (256,) and index.dtype == torch.uint8
+    assert torch.allclose(book[index.long()], values, atol=1e-6)
+
+
+def test_a_codebook_is_ascending_and_better_than_even_steps():
+    values = torch.randn(20_000, generator=torch.Generator().manual_seed(1))
+    book, index = codebook(values)
+    assert bool((book.diff() >= 0).all())
+    even = torch.linspace(float(values.min()), float(values.max()), 256)
+    error = (book[index.long()] - values).square().mean()
+    assert error < (values[:, None] - even).abs().amin(dim=1).square().mean()
+    assert float((book[index.long()] - values).abs().max()) <= float(book.diff().max())
+
+
+def test_many_rows_are_stood_for_by_near_ones():
+    rows = rows_of(5000, 9)
+    shares = []
+    book, index = palette(rows, shares.append)
+    assert len(book) == 4096 and shares[-1] == 1.0
+    # Each centre holds about 17 rows and has about 14 entries: nearly every row one of its own.
+    assert float((book[index] - rows).square().mean()) < 0.5 * 0.01**2

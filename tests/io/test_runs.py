@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import re
 import shutil
 
@@ -47,19 +46,6 @@ def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
     assert run.is_gaussian_scene
 
 
-@pytest.mark.parametrize("within", ["", "config.yml", "nerfstudio_models/step-000001999.ckpt"])
-def test_a_run_opens_by_any_of_its_names(make_run, within):
-    folder = make_run(steps=(1999, 9999))
-    run = open_run(folder / within)
-    assert run.folder == folder
-    assert run.step == (1999 if "ckpt" in within else 9999)
-
-
-def test_without_transforms_the_frame_is_the_datas_own(make_run):
-    run = open_run(make_run())
-    assert torch.equal(run.transform, torch.eye(4)[:3]) and run.scale == 1.0
-
-
 @pytest.mark.parametrize(
     "content",
     ["{", "[]", '{"scale": 1}', '{"transform": [[1, 0], [0, 1]], "scale": 1}', '{"transform": "no", "scale": 1}',
@@ -82,20 +68,6 @@ def test_an_incomplete_newest_checkpoint_gives_way_to_the_one_before(make_run, c
     assert f"{newest}: not a complete checkpoint" in caplog.text
 
 
-def test_steps_are_compared_as_numbers_and_other_files_ignored(make_run):
-    folder = make_run(steps=(999999999, 1000000000))
-    (folder / "nerfstudio_models" / "step-last.ckpt").write_bytes(b"")
-    (folder / "nerfstudio_models" / "notes.txt").write_text("")
-    assert open_run(folder).step == 1000000000
-
-
-def test_a_run_without_checkpoint_is_said(make_run):
-    folder = make_run(steps=())
-    fails(lambda: open_run(folder), folder, "no complete checkpoint in nerfstudio_models (none)")
-    (folder / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"PK")
-    fails(lambda: open_run(folder), "(1 incomplete)")
-
-
 def test_what_is_no_run_is_said(tmp_path):
     fails(lambda: open_run(tmp_path / "none"), "no such file or folder")
     fails(lambda: open_run(tmp_path), tmp_path, "not a nerfstudio run", "config.yml")
@@ -104,29 +76,6 @@ def test_what_is_no_run_is_said(tmp_path):
 
 
 # Where the data is
-
-
-def test_relative_data_is_found_from_the_current_folder_first(make_run, tmp_path, monkeypatch):
-    folder = make_run()
-    (tmp_path / "here" / "data" / "kitchen").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "here")
-    assert open_run(folder).data == tmp_path / "here" / "data" / "kitchen"
-
-
-def test_a_relative_run_finds_its_data_above_itself(make_run, tmp_path, monkeypatch):
-    folder = make_run()
-    monkeypatch.chdir(folder.parent)
-    assert open_run(folder.name).data == tmp_path / "data" / "kitchen"
-
-
-def test_missing_data_is_said_with_what_was_tried_and_only_where_needed(make_run, tmp_path):
-    folder = make_run()
-    shutil.rmtree(tmp_path / "data")
-    fails(
-        lambda: open_run(folder), folder / "config.yml", "data/kitchen is not there", "tried", os.getcwd(), "more above"
-    )
-    assert str(open_run(folder, need_data=False).data) == "data/kitchen"
-    assert len(read_scene(folder)) == 5
 
 
 def test_the_dataparsers_data_counts_where_the_datamanager_has_none(make_run, tmp_path):
@@ -157,12 +106,6 @@ def test_the_newest_finished_run_of_each_experiment_is_found(make_run, tmp_path)
     assert find_runs(newest)[0].folder == newest
 
 
-def test_a_descendant_of_splatfacto_is_known_by_its_settings_but_pointsplat_is_not(make_run):
-    folder = make_run(method="my-splats")
-    assert open_run(folder).is_gaussian_scene
-    assert not open_run(make_run(method="pointsplat")).is_gaussian_scene
-
-
 def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, tmp_path):
     folder = make_run(method="nerfacto")
     assert not open_run(folder).is_gaussian_scene
@@ -177,15 +120,6 @@ def test_flat_copies_of_runs_are_all_found_and_named_apart(make_run, tmp_path):
         shutil.copytree(make_run(outputs=f"outputs-{name}"), tmp_path / "flat" / name / "copy")
     runs, _, _ = find_runs_and_plys(tmp_path / "flat", "photos")
     assert list(runs) == ["kitchen", "kitchen-2"]
-
-
-def test_missing_data_of_one_run_among_many_is_an_error(make_run, tmp_path):
-    make_run("a")
-    broken = make_run("b")
-    text = (broken / "config.yml").read_text().replace("- kitchen\n", "- lost\n")
-    (broken / "config.yml").write_text(text)
-    fails(lambda: find_runs(tmp_path), broken / "config.yml", "data/lost is not there")
-    assert len(find_runs(tmp_path, need_data=False)) == 2
 
 
 @pytest.mark.parametrize(

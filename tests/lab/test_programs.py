@@ -1,16 +1,20 @@
-"""Every program of the lab starts and stands in its README; what programs share."""
+"""Programs of the lab, and fuzzing."""
 
+import logging
 import os
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
 import torch
 
 from lab.common import scenes
-from lab.common.results import Results
-from lab.common.timing import slope
+from lab.robustness import fuzz_judge
+from lab.robustness.fuzz_readers import READERS
+from lab.robustness.fuzzing import CORPUS
 from making import LAB, REPOSITORY
+from pointsplat_ns.errors import PointSplatError
 
 PROGRAMS = sorted(
     ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
@@ -59,21 +63,32 @@ def test_a_trained_scene_is_a_case_of_the_rasterizers_times(trained_walls):
     assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-5)  # float32
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"rows": []}'])
-def test_a_file_that_holds_no_rows_is_not_taken_up(tmp_path, text):
-    path = tmp_path / "rows.json"
-    path.write_text(text)
-    with pytest.raises(SystemExit, match="cannot be taken up"):
-        Results(path, {}, resume=True)
-    with pytest.raises(SystemExit, match="--resume without --json"):
-        Results(None, {}, resume=True)
-    assert path.read_text() == text
+NAMES = sorted(path.name for path in CORPUS.iterdir())
 
 
-def test_the_slope_is_the_exponent_of_what_is_positive():
-    counts = [100_000, 300_000, 1_000_000, 10_000_000]
-    assert slope(counts, [1e-5 * n**1.25 for n in counts]) == pytest.approx(1.25, abs=1e-9)
-    assert slope(counts, [1e290 * n for n in counts]) == pytest.approx(1.0, abs=1e-9)
-    assert slope(counts, [0.0, -1.0, 2.0, 20.0]) == pytest.approx(1.0)
-    assert slope(counts, [None, None, 2.0, 20.0]) == pytest.approx(1.0)
-    assert slope(counts[:1], [1.0]) is None and slope([5, 6], [1.0, 2.0]) is None and slope([], []) is None
+@pytest.fixture(autouse=True)
+def quiet():
+    logger = logging.getLogger("pointsplat_ns")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_fuzzing_kept_is_read_or_refused(name, tmp_path):
+    read, files = READERS[name](tmp_path), sorted((CORPUS / name).iterdir())
+    with suppress(PointSplatError):
+        read(files[0].read_bytes())  # imports what it needs, whose memory is not the file's
+    outcomes = {path.name: fuzz_judge.judge(read, path.read_bytes()) for path in files}
+    assert "read" in outcomes.values(), "or nothing beyond the first check is tried"
+
+
+def test_the_judge_stops_what_does_not_end(monkeypatch):
+    def endless(_):
+        while True:
+            pass
+
+    monkeypatch.setattr(fuzz_judge, "SECONDS", 0.1)  # of the processor
+    with pytest.raises(fuzz_judge.Wrong, match="more than 0.1 s"):
+        fuzz_judge.judge(endless, b"")

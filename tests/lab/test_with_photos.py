@@ -52,14 +52,6 @@ def test_all_ways_are_measured_and_trainings_with_a_cap_take_as_long_as_the_othe
     assert [found["needs_dense"] for found in rows] == [False] + [True] * 5 + [False] * 2
 
 
-def test_rows_that_are_there_are_not_measured_again(tmp_path):
-    rows = list(program.measured(Tried(tmp_path), (0.1,), []))
-    capture = Tried(tmp_path)
-    assert list(program.measured(capture, (0.1,), rows)) == [] and capture.asked == []
-    assert [found["method"] for found in program.measured(capture, (0.1,), rows[:-1])] == [CAP_LONG]
-    assert capture.asked[-1] == ("cap-100-10599", 10599, 100)
-
-
 def test_training_on_photos_ends_when_it_has_used_its_cpu_seconds():
     budget = CpuBudget(cpu_seconds=200.0, started=time.process_time() - 100)
     assert budget.share_done(3, 0.0) == pytest.approx(0.5, abs=0.05) and not budget.empty
@@ -72,16 +64,6 @@ ROWS = [
     row(0.1, SCORES["pup"], 26.5),
     row(0.1, CAP_LONG, 26.0, 755.0, "vr_project"),
 ]
-
-
-def test_the_page_has_leads_over_captures_and_seconds_with_the_dense_training():
-    lines = record.page(ROWS).splitlines()
-    assert f"| {DENSE} | -2.50 (-3.00 to -2.00), 2 |" in lines
-    assert f"| {SCORES['pup']} | +1.50 (+1.50 to +1.50), 1 |" in lines
-    assert f"| {CAP_LONG} | +1.00 (+1.00 to +1.00), 1 |" in lines
-    assert f"| 10 % | {COMPACTED} | 100 | 60 | 760 | 28.00 | 0.900 | - |" in lines
-    assert f"| 10 % | {CAP_LONG} | 100 | 755 | 755 | 26.00 | 0.900 | - |" in lines
-    assert not any(line.startswith(f"| {COMPACTED} |") for line in lines)
 
 
 def test_the_record_is_written_and_gives_the_same_page_again(tmp_path):

@@ -1,4 +1,4 @@
-"""The content of a scene: its place and size, and fewer Gaussians that cover as much."""
+"""Content, what shows it, and poses."""
 
 import math
 
@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from making import ball, box_room
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
+from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
+from pointsplat_ns.looking.coverage import coverage
+from pointsplat_ns.looking.fill import fill
+from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
@@ -38,11 +40,6 @@ def test_content_without_a_size_or_that_is_not_visible_has_size_one(name):
     assert content_size(one.replace(**{name: torch.full_like(getattr(one, name), -math.inf)}))[1] == 1.0
 
 
-def test_the_box_of_content_that_is_not_visible_is_an_error():
-    with pytest.raises(DataError, match="nothing of the scene can be seen"):
-        content_box(ball(3, opacity=-math.inf))
-
-
 def test_a_thinned_scene_covers_as_much():
     room = in_units(box_room(0), *content_size(box_room(0)))
     thin = thinned(room, len(room) // 8)
@@ -54,3 +51,79 @@ def test_a_thinned_scene_covers_as_much():
         return float(1 - render(black, Views(view.viewmat[None], view.K[None], 64, 48, white)[0]).mean())
 
     assert len(thin) <= len(room) // 8 + len(room) // 64 and cover(thin) > 0.8 * cover(room)
+
+
+def test_views_all_around_show_nearly_all_and_one_side_less():
+    scene = ball(600)
+    around = sample_views(scene, 24, 64, 48)
+    one_side = around[[0, 0, 0]]
+    assert coverage(scene, around) > 0.9
+    assert 0.05 < coverage(scene, one_side) < 0.75
+
+
+def test_a_scene_that_is_not_visible_has_coverage_zero():
+    scene = ball(50)
+    views = sample_views(scene, 2, 64, 48)
+    assert coverage(scene.replace(opacities=torch.full_like(scene.opacities, -30.0)), views) == 0.0
+
+
+K = torch.tensor([[[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]]])
+
+VIEWS = Views(torch.eye(4)[None], K, 100, 100, torch.zeros(3))
+"""At a depth of 5, a unit is 20 pixels; the picture has 10,000."""
+
+
+def flat(x: float, stds: tuple[float, float], alpha: float, turn: float = 0.0, copies: int = 1) -> Gaussians:
+    """Flat Gaussians that face the camera, at (x, 0, 5); ``turn`` radians about its axis."""
+    scene = Gaussians.empty().replace(
+        means=torch.tensor([[x, 0.0, 5.0]]),
+        scales=torch.tensor([[*stds, 1e-9]]).log(),
+        quats=torch.tensor([[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]]),
+        opacities=torch.tensor([[alpha]]).logit(),
+        features_dc=torch.zeros(1, 3),
+        features_rest=torch.zeros(1, 0, 3),
+    )
+    return scene[torch.zeros(copies, dtype=torch.int64)]
+
+
+def rectangle(reach: float, stds: tuple[float, float]) -> float:
+    """Pixels of a rectangle; 0.3 pixels^2 are added to each variance of the projection."""
+    return math.prod(2 * reach * math.sqrt((20 * std) ** 2 + 0.3) for std in stds)
+
+
+SQUARE, LONG = (0.1, 0.1), (0.4, 0.05)
+
+FAINT = math.sqrt(2 * math.log(255 * 0.02))  # where an opacity of 0.02 falls to 1/255
+
+
+@pytest.mark.parametrize(
+    "scene, pixels",
+    [
+        (flat(0.0, SQUARE, 0.9), rectangle(math.sqrt(8), SQUARE)),
+        (flat(0.0, LONG, 0.9, turn=0.5), rectangle(math.sqrt(8), LONG)),
+        (flat(0.0, SQUARE, 0.02), rectangle(FAINT, SQUARE)),
+        (flat(0.0, SQUARE, 0.9, copies=3), 3 * rectangle(math.sqrt(8), SQUARE)),
+        (flat(-2.5, SQUARE, 0.9), rectangle(math.sqrt(8), SQUARE) / 2),  # its middle is on the edge of the picture
+        (flat(0.0, (100.0, 100.0), 0.9), 10_000),  # all of the picture
+        (flat(-20.0, SQUARE, 0.9), 0),  # outside
+        (flat(0.0, SQUARE, 0.001), 0),  # fainter than 1/255
+    ],
+)
+def test_fill_is_the_area_of_rectangles_over_that_of_the_picture(scene, pixels):
+    assert fill(scene, VIEWS) == pytest.approx(pixels / 10_000, rel=1e-4)  # float32
+
+
+def test_a_picture_holds_points_in_front_and_inside_of_its_edges():
+    """Focal length 10 and 16 pixels: the edge is at 0.8 of the depth. The second camera is a unit farther back."""
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    viewmats[1, 2, 3] = 1.0
+    K = torch.tensor([[10.0, 0, 8], [0, 10.0, 8], [0, 0, 1.0]])
+    views = Views(viewmats, K.repeat(2, 1, 1), 16, 16, torch.zeros(3))
+    x = torch.tensor([0.0, 0.0, 0.0, 0.79, 0.81, -0.79, -0.81, 0.0], dtype=torch.float64)
+    z = torch.tensor([1.0, -2.0, 0.0, 1, 1, 1, 1, 1e300], dtype=torch.float64)
+    for points in (torch.stack([x, 0 * x, z], 1), torch.stack([0 * x, x, z], 1)):
+        first, second = in_pictures(views, points).tolist()
+        assert first == [True, False, False, True, False, True, False, True]
+        assert second == [True, False, True, True, True, True, True, True]
+        assert in_pictures(views, points, min_depth=1.0)[0].tolist() == [False] * 7 + [True]
+    assert not in_pictures(views, torch.full((1, 3), torch.nan, dtype=torch.float64)).any()

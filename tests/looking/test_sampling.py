@@ -10,7 +10,6 @@ from upright_scenes import TURNS, room, tower, turned
 from making import photographed
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
@@ -48,11 +47,6 @@ def test_an_object_is_looked_at_from_around_it(make_hollow_ball):
     assert all(render(blob, views[i]).max() > 0.2 for i in range(len(views)))
 
 
-def test_one_gaussian_is_looked_at(hollow_ball):
-    views = sample_views(hollow_ball[5:6], 2, 64, 48)
-    assert len(views) >= 1 and render(hollow_ball[5:6], views[0]).max() > 0
-
-
 @pytest.mark.parametrize(
     "name, value",
     [("scales", 1e4), ("scales", -1e4), ("opacities", 1e4), ("opacities", -1e4), ("quats", 0.0), ("quats", 3e38),
@@ -72,12 +66,6 @@ def test_a_scene_that_shows_nothing_has_no_poses(hollow_ball):
             sample_views(nothing, 3)
     with pytest.raises(DataError, match="0 views asked for"):
         sample_views(hollow_ball, 0)
-
-
-def test_the_box_is_not_moved_by_an_outlier(hollow_ball):
-    low, high = content_box(hollow_ball)
-    assert torch.allclose(0.5 * (low + high), torch.tensor([5.0, 0.0, 0.0]).double(), atol=0.3)
-    assert (high - low < 4.1).all() and (high - low > 3).all()
 
 
 def test_looking_straight_up_or_at_oneself_is_a_rotation_too():
@@ -175,10 +163,6 @@ def test_a_view_that_a_few_large_gaussians_fill_is_not_taken(make_hollow_ball):
         away = (scene.means.double() - places_of(views).mean(0)).norm(dim=1)
         subtended.append(float((shares * scene.stds.amax(1) / away).sum() / shares.sum()))
     assert len(views) >= 1 and max(subtended) < 0.2
-
-
-def test_a_scene_of_few_large_gaussians_has_views_as_well(make_hollow_ball):
-    assert len(sample_views(make_hollow_ball(40), 4, 64, 48)) == 4
 
 
 @pytest.mark.parametrize("off", [{"photo_share": 0.0}, {"min_sh_evidence": math.inf}])

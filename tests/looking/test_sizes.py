@@ -1,16 +1,19 @@
-"""Pictures of several sizes: few pixels of a large picture are those of the large picture."""
+"""Size changes that renders choose, and how near a scene is to the dense one."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
-from making import ball
+from making import ball, cloud
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RendersOfSizes, middle_sized, parse_resolution, sides_of, subsampled, two_sizes
+from pointsplat_ns.looking.sizes import RendersOfSizes, parse_resolution, sides_of, subsampled
+from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import EPS2D
+from pointsplat_ns.views import Views
 
 
 @pytest.fixture(scope="module")
@@ -30,34 +33,6 @@ def test_a_subsampled_picture_is_every_so_many_th_pixel_of_the_large_one(scene, 
     few = render(scene, subsampled(wide, 642, 214)[0])
     assert float(every_third.std()) > 0.01
     torch.testing.assert_close(few, every_third, atol=2e-5, rtol=0)
-
-
-def test_pictures_larger_than_the_views_own_are_as_from_nearer(views):
-    near, full = subsampled(views, 1280, 320), subsampled(views, 640, 320)
-    assert (near.width, near.height) == (full.width, full.height) == (320, 240)
-    assert near.eps2d == full.eps2d / 4 == EPS2D / 16
-
-
-def test_a_subsampled_picture_of_its_own_size_is_the_reduced_picture(views):
-    small, same = views.resized(320), subsampled(views, 320, 320)
-    assert same.eps2d == EPS2D and torch.equal(same.Ks, small.Ks) and (same.width, same.height) == (320, 240)
-
-
-def test_two_sizes_have_as_many_pixels(views):
-    middle, full = two_sizes(views)
-    assert (middle.width, middle.height) == (full.width, full.height) == (453, 340)
-    assert middle.eps2d == EPS2D and full.eps2d == EPS2D * (453 / 640) ** 2
-    small, same = two_sizes(views.resized(200))
-    assert small.eps2d == same.eps2d == EPS2D and small.width == same.width == 200
-
-
-def test_a_picture_that_is_no_larger_than_a_window_has_one_size():
-    assert sides_of(320, 200) == (320,) and sides_of(1, 1) == (1,)
-    assert sides_of(1080, 1920) == sides_of(1920, 1080)
-
-
-def test_views_of_a_middle_size(views):
-    assert max(middle_sized(views).width, middle_sized(views).height) == sides_of(640, 480)[1]
 
 
 def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, views):
@@ -83,3 +58,60 @@ def test_what_is_no_resolution_is_refused(text):
 
 def test_a_resolution_is_read():
     assert parse_resolution(" 640X480".strip()) == (640, 480) and parse_resolution(None) is None
+
+
+SCENE = cloud(200)
+
+
+def test_closeness_is_that_of_the_metrics_over_covered_pixels(hollow_ball, ball_views):
+    reference, kept, shares = DenseReference(hollow_ball, ball_views), hollow_ball[:900], []
+    close = reference.closeness(kept, shares.append)
+    pictures = torch.stack([render(kept, ball_views[i]) for i in range(4)]).double()
+    wanted = torch.stack(reference.renders).double()
+    covered = torch.tensor(reference.covered).double()
+    each = psnr(pictures, wanted) + 10 * covered.log10()
+    overall = -10 * torch.log10((pictures - wanted).square().mean() / covered.mean())
+    # 1e-5: shares in float32 here, and float64 means, summed in another order
+    assert close.psnr == pytest.approx(float(overall), abs=1e-5)
+    assert close.worst == pytest.approx(float(each.min()), abs=1e-5) and close.worst < close.psnr
+    assert close.ssim == pytest.approx(float(ssim(pictures, wanted).mean()), abs=1e-5)  # float32 there
+    assert reference.psnr(kept) == (close.psnr, close.worst) and shares == [0.25, 0.5, 0.75, 1.0]
+    assert reference.closeness_of(render(kept, view) for view in ball_views) == close
+    itself = reference.closeness(hollow_ball)
+    assert itself.psnr == itself.worst == math.inf and itself.ssim == pytest.approx(1.0)
+    assert DenseReference(hollow_ball, ball_views.resized(10)).closeness(kept).ssim is None
+
+
+@pytest.mark.parametrize("both_backgrounds", [False, True])
+def test_empty_margins_bring_nothing_closer(both_backgrounds):
+    narrow = _ahead()
+    K = narrow.Ks.clone()
+    K[:, 0, 2] += narrow.width
+    wide = dataclasses.replace(narrow, Ks=K, width=3 * narrow.width)
+    one, other = (DenseReference(SCENE, views, both_backgrounds) for views in (narrow, wide))
+    assert 0 < other.covered[0] == pytest.approx(one.covered[0] / 3, rel=1e-6)
+    assert other.psnr(SCENE[:150]) == pytest.approx(one.psnr(SCENE[:150]), abs=1e-3)
+
+
+def test_what_is_covered_is_where_the_background_does_not_show():
+    views = _ahead()
+    white, black = (dataclasses.replace(views, background=torch.full((3,), value)) for value in (1.0, 0.0))
+    shows_through = float((render(SCENE, white) - render(SCENE, black)).mean())
+    [covered] = DenseReference(SCENE, views).covered
+    assert covered == pytest.approx(1 - shows_through, abs=1e-3) and 0.05 < covered < 0.5
+
+
+def test_where_the_dense_scene_covers_nothing_all_pixels_count():
+    behind = _ahead(-5.0)
+    nothing = DenseReference(SCENE, behind)
+    assert nothing.covered == (0.0,) and nothing.psnr(SCENE)[0] == math.inf
+    moved = SCENE.replace(means=SCENE.means + torch.tensor([0.0, 0.0, 10.0]))
+    assert nothing.psnr(moved)[0] == pytest.approx(float(psnr(render(moved, behind[0]), nothing.renders[0])), abs=1e-4)
+
+
+def _ahead(distance: float = 5.0) -> Views:
+    """A view of all of :data:`SCENE`, a unit cube, from a distance."""
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([-0.5, -0.5, distance])
+    K = torch.tensor([[96.0, 0.0, 32.0], [0.0, 96.0, 32.0], [0.0, 0.0, 1.0]])
+    return Views(viewmat[None], K[None], 64, 64, torch.zeros(3))

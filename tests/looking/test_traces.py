@@ -1,19 +1,25 @@
-"""Traces of photos in a scene: photo places and trace factors."""
+"""Traces of photos, and where views come from."""
 
+import dataclasses
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from making import EYES, ball, normal_scene, photographed
+from making import EYES, ball, box_room, normal_scene, photographed
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.looking.traces import correlation, log_norms, photo_places, trace_factors
+from pointsplat_ns.looking.traces import PhotoPlaces, correlation, photo_places, trace_factors
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.views import Views
 
 
 def test_places_of_photos_are_found():
@@ -32,31 +38,6 @@ def sized_by_distance_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
     means = shell.means * torch.rand(3000, 1, generator=generator) ** (1 / 3)
     scales = (0.08 * (means - eye).norm(dim=1, keepdim=True)).log() + 0.1 * torch.randn(3000, 3, generator=generator)
     return shell.replace(means=means, scales=scales, features_rest=torch.zeros_like(shell.features_rest))
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_without_sh_sizes_tell_where_photos_were_taken(degree):
-    eye = torch.tensor([0.7, 0.2, 0.0])
-    places, shares = photo_places(sized_by_distance_from(eye, degree))
-    assert float(shares.sum()) == pytest.approx(1) and bool((shares >= 0).all())
-    towards = torch.nn.functional.normalize((shares[:, None] * places).sum(0), dim=0)
-    assert float(towards @ eye.double() / eye.norm()) > 0.95
-
-
-def test_random_sizes_are_no_evidence():
-    scene = sized_by_distance_from(torch.zeros(3))
-    scales = torch.randn(3000, 3, generator=torch.manual_seed(3)) - 2
-    assert photo_places(scene.replace(scales=scales)) is None
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_photo_places_by_size_move_and_scale_with_the_scene(scale):
-    scene = Gaussians(*(value.double() for value in sized_by_distance_from(torch.tensor([0.7, 0.2, 0.0])).tensors()))
-    places, shares = photo_places(scene)
-    moved = scene.replace(means=scale * (scene.means + 100), scales=scene.scales + math.log(scale))
-    other, as_large = photo_places(moved)
-    torch.testing.assert_close(other / scale - 100, places, atol=1e-5, rtol=0)
-    torch.testing.assert_close(as_large, shares, atol=1e-4, rtol=0)
 
 
 def test_infinite_sizes_and_gaussians_at_one_position_break_nothing():
@@ -79,13 +60,6 @@ def test_correlation_is_that_of_float64_at_any_size(size):
     assert float(correlation(size * a, b)) == pytest.approx(expected, abs=1e-12)
     assert float(correlation(torch.full_like(a, size), b)) == pytest.approx(0, abs=1e-6)
     assert float(correlation(torch.zeros_like(a), b)) == 0
-
-
-def test_log_norms_of_nothing_are_finite():
-    lengths = torch.tensor([0.0, 1e-150, 1.0, 1e150], dtype=torch.float64)
-    logs = log_norms(lengths[:, None] * torch.tensor([0.6, 0.0, 0.8]).double())
-    assert bool(logs.isfinite().all()) and bool((logs.diff() > 0).all())
-    assert float(logs[3]) == pytest.approx(150 * math.log(10))
 
 
 @pytest.mark.parametrize(
@@ -162,12 +136,6 @@ def test_trace_factors_grow_with(scene, options, ratio, tolerance):
     assert factors.dtype == torch.float32 and float(factors.log().median().abs()) < 1
 
 
-def test_trace_factors_are_one_if_all_gaussians_are_alike():
-    scene = ball(500, 0).replace(scales=torch.full((500, 3), -3.0))
-    assert trace_factors(scene, torch.arange(500)).tolist() == [1.0] * 500
-    assert trace_factors(scene, torch.tensor([7])).tolist() == [1.0]
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_extremes_stay_within_bounds(dtype):
     scene = Gaussians(*(value.to(dtype) for value in halves(0.0).tensors()))
@@ -209,3 +177,79 @@ def test_views_are_sampled_where_photos_were_taken_and_look_at_what_they_showed(
         assert len(views) == 6
     assert eyes[0] < 0.8 * eyes[1]
     assert ahead[0] > 0.6 and ahead[0] > ahead[1] + 0.3
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return ball(400)
+
+
+def run_of(trained_walls: Path, name: str) -> Path:
+    (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
+    return run
+
+
+def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):
+    source = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=dataset_views)
+    views = source.views(4)
+    assert len(views) == 4 and source.origin == "poses of the dataset"
+    assert (views.width, views.height) == (64, 48) and views.rasterize_mode == "antialiased"
+    assert views.background.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_known_views_are_given_or_those_of_the_dataset_and_never_sampled(scene, trained_walls):
+    assert ViewSource(scene, run="scene.ply", dataset_views=dataset_views).known(4) is None
+    of_run = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=dataset_views)
+    known = of_run.known(4)
+    assert known is not None and len(known) == 4 and of_run.origin == "poses of the dataset"
+    given = sample_views(scene, 6, 32, 24)
+    assert len(ViewSource(scene, given=given).known(3)) == 3
+    assert ViewSource(scene, given=given[:0]).known(3) is None
+
+
+def data_is_gone(path: Path | str) -> Views:
+    raise SceneError("its data is not there")
+
+
+def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses(scene, trained_walls):
+    source = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=data_is_gone)
+    assert len(source.views(2)) == 2
+    assert source.origin == f"poses sampled in free space, up is {source.up} (no dataset: its data is not there)"
+
+
+def test_a_run_whose_data_is_gone_and_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
+    nothing = ViewSource(scene[:0], run=run_of(trained_walls, "wall-a"), dataset_views=data_is_gone)
+    with pytest.raises(DataError, match="nothing of the scene can be seen"):
+        nothing.views(2)
+    assert nothing.origin == ""
+
+
+def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_given_ones(scene):
+    asked = ViewSource(scene, resolution=(96, 54)).views(2)
+    assert (asked.width, asked.height) == (96, 54)
+    given = sample_views(scene, 2, 900, 600)
+    assert ViewSource(scene, given=given, resolution=(300, 200)).views(2).width == 300
+    assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
+
+
+def test_a_scene_without_known_views_is_repaired_before_another_background_as_well(scene):
+    views = ViewSource(scene, resolution=(64, 48)).others()
+    behind = [next(views).background.tolist() for _ in range(10)]
+    assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8
+
+
+def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):
+    given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
+    assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
+
+
+def test_sampled_poses_near_photo_places_say_so(monkeypatch):
+    asked = []
+    photos = PhotoPlaces(torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64), torch.ones(1))
+    monkeypatch.setattr(
+        "pointsplat_ns.looking.sampling.photo_places", lambda scene, settings: asked.append(scene) or photos
+    )
+    source = ViewSource(box_room(0))
+    assert len(source.views(3)) and len(source.compared())
+    assert source.origin.startswith("poses sampled in free space, half of them where photos were taken, up is ")
+    assert len(asked) == 1  # the search for photo places takes seconds

@@ -1,4 +1,4 @@
-"""Which way is up in a scene without cameras, and the upright box around it."""
+"""The upward direction and the opening view."""
 
 import math
 from dataclasses import replace
@@ -10,13 +10,20 @@ from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.looking.opening import opening_views
+from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
+from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
-from pointsplat_ns.looking.upright import UprightBox, axis_named, level_directions, levelness, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import Up, axis_named, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
 PLACES = torch.linspace(0, 2 * math.pi, 61)[:60]
+
 EDGES = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
 
 
@@ -51,28 +58,6 @@ def test_up_is_a_guess_without_evidence():
     assert float(up.direction.norm()) == pytest.approx(1) and not up.sure
 
 
-@pytest.mark.parametrize("turn", TURNS)
-def test_the_box_turns_with_the_scene(turn):
-    scene = turned(box_room(0, 3000), turn)
-    centre, size = content_size(scene)
-    surface = Surface.of(scene, centre, size)
-    box = UprightBox.of(surface, torch.from_numpy(turn.apply(UP.numpy())))
-    assert torch.allclose(box.frame @ box.frame.T, torch.eye(3).double(), atol=1e-12)
-    found = sorted(((box.high - box.low) * size / 10).tolist())
-    # nine tenths of each axis, between walls; 12 %: yaws are 5 degrees apart, and points are drawn at random
-    assert found == pytest.approx([2.0, 3.0, 4.0], rel=0.12)
-    places = box.places(100, torch.Generator().manual_seed(0))
-    heights = box.heights(places)
-    assert bool(((heights >= 0) & (heights <= 1)).all())
-
-
-def test_level_directions_are_level_for_any_up():
-    for up in (*torch.eye(3).double(), torch.tensor([0.6, 0.0, -0.8]).double()):
-        found = level_directions(up, torch.linspace(0, 6, 7).double())
-        assert torch.allclose(found @ up, torch.zeros(7).double(), atol=1e-12)
-        assert torch.allclose(found.norm(dim=1), torch.ones(7).double(), atol=1e-12)
-
-
 def test_points_stand_for_what_can_be_seen_and_are_finite():
     scene = box_room(0)
     far = scene.means.clone()
@@ -83,17 +68,6 @@ def test_points_stand_for_what_can_be_seen_and_are_finite():
     assert bool(surface.normals.isfinite().all()) and bool(surface.points.isfinite().all())
     flat = scene.replace(scales=torch.full_like(scene.scales, -math.inf))
     assert bool(Surface.of(flat, *content_size(flat)).points.isfinite().all())
-
-
-def test_a_wall_hides_what_is_behind_it():
-    scene = plates(((1, 0, 0), (0, 1, 1)), ((2, 0, 0), (0, 0.5, 0.5)), density=400)
-    surface = Surface.of(scene, torch.zeros(3, dtype=torch.float64), 10.0)
-    visible, enclosure = surface.visible_from(torch.tensor([[-1.0, 0, 0], [4.0, 0, 0]], dtype=torch.float64))
-    first = surface.points[:, 0] < 1.5
-    assert float(visible[0, first].float().mean()) > 0.95 and float(visible[0, ~first].float().mean()) < 0.05
-    assert float(visible[1, ~first].float().mean()) > 0.95
-    assert bool((enclosure < 0.2).all())
-    assert float(surface.clearance(torch.zeros(1, 3).double())) == pytest.approx(1.0, abs=0.1)
 
 
 def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
@@ -108,15 +82,6 @@ def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
     )
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-200, 1e-30, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_levelness_is_a_share_for_places_of_any_spread(size, dtype):
-    places = (size * torch.stack([PLACES.cos(), PLACES.sin(), 0.1 * PLACES], dim=1).double()).to(dtype)
-    for some in (places, places[:1]):
-        found = levelness(torch.eye(3).double(), PhotoPlaces(some, torch.full((len(some),), 1 / len(some))))
-        assert bool(((found >= 0) & (found <= 1)).all())
-
-
 def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
     """A cube has three; photos were taken from all around it, at about one height."""
     cube = plates(*(((side * x, side * y, side * z), (1 - x, 1 - y, 1 - z)) for x, y, z in EDGES for side in (-1, 1)))
@@ -128,15 +93,79 @@ def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
         assert float(found[axis].abs()) > math.cos(math.radians(3))
 
 
-@pytest.mark.parametrize(("from_above", "up", "sure"), [(0.3, UP, True), (-0.3, -UP, True), (-0.05, UP, False)])
-def test_up_is_sure_where_clearly_more_is_seen_from_above(from_above, up, sure):
-    surface = Surface.of(tower(), *content_size(tower()))
-    found = pointing_up(surface, UP, from_above)
-    assert torch.equal(found.direction, up) and found.sure is sure
-    assert str(found).endswith("(a guess)") is not sure
-
-
 @pytest.mark.parametrize("name", ["w", "", "--z", "zz", "1"])
 def test_other_names_of_axes_are_refused(name):
     with pytest.raises(PointSplatError, match="expected x, y, z, -x, -y or -z"):
         axis_named(name)
+
+
+def statue() -> Gaussians:
+    """A figure of 1 x 2.4 units on a block; its face, at x = 0.05, has many more Gaussians than its back."""
+    fine = plates(((0.05, 0, 2.2), (0, 0.5, 1.2)), density=300)
+    fine = fine.replace(scales=fine.scales - 0.7)
+    block = [((0, 0, z), (0.5, 0.5, 0)) for z in (0.8, 0.9, 1.0)]
+    coarse = plates(((-0.05, 0, 2.2), (0, 0.5, 1.2)), *block, density=60)
+    return Gaussians(*(torch.cat(both) for both in zip(fine.tensors(), coarse.tensors(), strict=True)))
+
+
+def corner() -> Gaussians:
+    """Two walls, a floor, and a table of which photos showed the top."""
+    table = plates(((0.3, 0.3, 0.9), (0.8, 0.8, 0)), density=300)
+    walls = plates(((-2, 0, 1.2), (0, 2, 1.2)), ((0, -2, 1.2), (2, 0, 1.2)), ((0, 0, 0), (2, 2, 0)), density=40)
+    walls = walls.replace(scales=walls.scales + torch.tensor([0.5, 0.5, 0.5]))
+    return Gaussians(*(torch.cat(both) for both in zip(table.tensors(), walls.tensors(), strict=True)))
+
+
+@pytest.mark.parametrize(("width", "height"), [(960, 600), (400, 500)])
+@pytest.mark.parametrize("turn", TURNS[:2])
+def test_an_object_is_whole_and_upright_from_every_side(turn, width, height):
+    scene, up = turned(statue(), turn), torch.from_numpy(turn.apply(UP.numpy()))
+    found = opening_views(scene, 3, width, height, Up(up))
+    assert found.whole and len(found.views) == 3
+    assert bool(in_pictures(found.views, scene.means.double()).all()), "nothing is cut off"
+    down = found.views.viewmats[:, 1, :3]
+    assert bool((down @ up < -0.9).all()) and float((found.views.viewmats[:, 0, :3] @ up).abs().max()) < 1e-9
+    eyes = torch.linalg.inv(found.views.viewmats)[:, :3, 3]
+    assert float(torch.cdist(eyes, eyes).fill_diagonal_(9.0).min()) > 1.0, "the views are from different sides"
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0), (0, 1, 0)])
+def test_up_is_the_side_from_which_more_is_seen(axis):
+    """Also where -y is usual."""
+    turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
+    scene = turned(corner(), turn)
+    assert Sampler(scene).up.direction.tolist() == list(map(float, axis))
+    without = replace(LOOKING, min_seen_from_above=math.inf)
+    if axis == (0, 1, 0):
+        assert Sampler(scene, settings=without).up.direction.tolist() == [0.0, -1.0, 0.0]
+
+
+def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():
+    scene = room()
+    found = opening_views(scene, 4, up=Up(UP))
+    assert not found.whole and len(found.views) == 4
+    eyes = torch.linalg.inv(found.views.viewmats)[:, :3, 3]
+    assert bool((eyes.abs() < torch.tensor([2.0, 1.5, 1.2])).all()), "inside"
+    counts = in_pictures(found.views, scene.means.double()).sum(1)
+    assert float(counts[0]) > 0.25 * len(scene)
+    shown = in_pictures(found.views, scene.means.double()).any(0).double().mean()
+    assert float(shown) > float(counts[0]) / len(scene) + 0.2, "the others show what the first does not"
+
+
+def test_photos_of_a_room_come_before_a_view_from_outside_and_keep_their_background():
+    scene = room()
+    eyes = torch.tensor([[-1.5, -1.0, 0.3], [1.5, 1.0, 0.3], [0.0, 0.0, 0.2]], dtype=torch.float64)
+    targets = torch.tensor([[1.5, 1.0, -0.5], [-1.5, -1.0, -0.5], [0.0, 0.0, 1.2]], dtype=torch.float64)
+    photos = replace(views_of(look_at(eyes, targets, UP), 64, 40, 5.0), background=torch.tensor([0.1, 0.2, 0.3]))
+    found = opening_views(scene, 2, known=photos)
+    assert not found.whole and found.views.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert all(any(torch.equal(view, photo) for photo in photos.viewmats) for view in found.views.viewmats)
+    assert not torch.equal(found.views.viewmats[0], photos.viewmats[2]), "the ceiling shows least"
+
+
+def test_photos_that_cut_an_object_off_come_after_it_whole():
+    scene = statue()
+    near = look_at(torch.tensor([[1.0, 0.0, 1.6]]).double(), torch.tensor([[0.0, 0.0, 1.6]]).double(), UP)
+    photos = replace(views_of(near, 64, 40, 5.0), rasterize_mode="antialiased")
+    found = opening_views(scene, 1, known=photos)
+    assert found.whole and found.views.rasterize_mode == "antialiased"

@@ -1,22 +1,20 @@
-"""PSNR and SSIM against what other projects report, and at the extremes."""
+"""PSNR and structural similarity."""
 
 import math
 
 import pytest
 import torch
+from pytorch_msssim import SSIM
 
 from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError, psnr, psnr_of, ssim
+from pointsplat_ns.metrics.structural_similarity import KERNELS, mean_ssim
 
 
 def test_psnr_of_a_known_error():
     target = torch.full((8, 8, 3), 0.5, dtype=torch.float64)
     for decibels in (10.0, 20.0, 30.0):
         assert float(psnr(target + 10 ** (-decibels / 20), target)) == pytest.approx(decibels, abs=1e-9)
-
-
-def test_psnr_of_identical_images_is_infinite():
-    assert float(psnr(*[torch.rand(4, 4, 3)] * 2)) == math.inf
 
 
 @pytest.mark.parametrize("covered", [1.0, 0.25, 1e-300])
@@ -56,16 +54,6 @@ def test_ssim_in_float32_is_ssim_in_float64_on_dark_bright_and_striped_images():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_a_batch_gives_one_value_an_image(metric):
-    a, b = pair(3, 16, 20)
-    values = metric(a, b)
-    assert values.shape == (3,)
-    for i in range(3):
-        assert metric(a[i], b[i]).shape == ()
-        assert float(values[i]) == pytest.approx(float(metric(a[i], b[i])), rel=1e-5)  # float32 sums
-
-
-@pytest.mark.parametrize("metric", [psnr, ssim])
 def test_gradients_agree_with_float64_differences(metric):
     a, b = pair(12, 13, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: metric(x, b), a.requires_grad_(), fast_mode=True)
@@ -85,6 +73,84 @@ def test_gradients_agree_with_float64_differences(metric):
 def test_images_that_cannot_be_compared_are_said(metric, a, b, message):
     with pytest.raises(ImageError, match=message):
         metric(a, b)
+
+
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
+
+
+def images(*shape: int, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(11)
+    image = torch.rand(shape, generator=generator, dtype=dtype)
+    return image.requires_grad_(), (0.7 * image.detach() + 0.3 * torch.rand(shape, generator=generator, dtype=dtype))
+
+
+@pytest.mark.filterwarnings("ignore:Skipping Gaussian Smoothing")
+@pytest.mark.parametrize("size", [(40, 33), (11, 11), (12, 5), (4, 30), (3, 3)])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_value_and_gradient_are_pytorch_msssims(size, batch):
+    image, other = images(batch, 3, *size)
+    stock = SSIM(data_range=1.0, size_average=True, channel=3)
+    value, expected = mean_ssim(image, other), stock(image, other)
+    # pytorch-msssim keeps its window in float32: 1e-7 relative on moments of order 1, over C2 = 9e-4 at worst.
+    torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
+    (gradient,), (other_gradient,) = (torch.autograd.grad(v, image) for v in (value, expected))
+    assert (gradient - other_gradient).abs().max() <= 1e-4 * other_gradient.abs().max()
+
+
+def test_gradients_of_ssim_agree_with_float64_differences():
+    image, other = images(1, 2, 12, 13)
+    assert torch.autograd.gradcheck(mean_ssim, (image, other.requires_grad_()))
+
+
+@pytest.mark.parametrize("compiled", [None, False], ids=["as it is", "torch"])
+@pytest.mark.parametrize("level", [0.0, 1e-4, 0.5, 1.0])
+def test_flat_images_in_float32_match_float64_in_value_and_gradient(level, compiled):
+    noise = 1e-3 * images(1, 3, 20, 20)[1]
+    result = {}
+    for dtype in (torch.float32, torch.float64):
+        image = torch.full((1, 3, 20, 20), level, dtype=dtype).requires_grad_()
+        value = mean_ssim(image, (image + noise.to(dtype)).detach(), compiled)
+        value.backward()
+        result[dtype] = value.detach().double(), image.grad.double()
+    # Variances are differences of squares near level^2, so 6e-8 of it is lost, relative to C2 = 9e-4.
+    torch.testing.assert_close(result[torch.float32][0], result[torch.float64][0], atol=1e-3, rtol=0)
+    assert (result[torch.float32][1] - result[torch.float64][1]).abs().max() < 1e-3
+
+
+def found(image, other, dtype, compiled, first=True):
+    """SSIM of two images, and its gradient by one of them, as float64."""
+    leaf = (image if first else other).detach().to(dtype, copy=True).requires_grad_()
+    pair = (leaf, other.detach().to(dtype)) if first else (image.detach().to(dtype), leaf)
+    value = mean_ssim(*pair, compiled)
+    (gradient,) = torch.autograd.grad(value, leaf)
+    return value.detach().double(), gradient.double()
+
+
+@needs_compiler
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("together", [True, False], ids=["channels together", "planes"])
+@pytest.mark.parametrize("shape", [(1, 3, 11, 11), (1, 3, 130, 150), (2, 1, 12, 139), (2, 4, 60, 43), (1, 6, 11, 40)])
+def test_compiled_it_is_torchs_and_as_near_to_float64(shape, together, first):
+    image, other = images(*shape)
+    if together:
+        image, other = (x.detach().to(memory_format=torch.channels_last) for x in (image, other))
+    ours, torchs = (found(image, other, torch.float32, compiled, first) for compiled in (True, False))
+    exact = found(image, other, torch.float64, False, first)
+    assert abs(ours[0] - exact[0]) <= 1e-6
+    assert (ours[1] - exact[1]).norm() <= 2 * (torchs[1] - exact[1]).norm() + 1e-6 * exact[1].norm()
+
+
+@needs_compiler
+def test_compiled_a_pixel_that_is_not_finite_spoils_no_gradient_beyond_its_windows():
+    image, other = (x.detach() for x in images(1, 3, 40, 300))
+    clean = found(image, other, torch.float32, True)[1]
+    for wrong in (math.nan, math.inf):
+        image[0, 1, 20, 150] = wrong
+        value, gradient = found(image, other, torch.float32, True)
+        expected = torch.zeros_like(gradient, dtype=torch.bool)
+        expected[0, 1, 0:40, 140:161] = True  # 20 rows either way
+        assert value.isnan() and gradient[0, 1, 10:31, 140:161].isnan().all()
+        assert torch.equal(gradient[~expected], clean[~expected])
 
 
 def test_images_below_the_window_are_said():

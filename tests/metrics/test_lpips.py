@@ -13,14 +13,7 @@ import torch
 from making import SHARED_DATA
 from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError, lpips
-from pointsplat_ns.metrics.lpips import (
-    WEIGHTS_VARIABLE,
-    LpipsUnavailable,
-    ReportedLpips,
-    cached_lpips,
-    empty_features,
-    load_lpips,
-)
+from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE, LpipsUnavailable, ReportedLpips, empty_features, load_lpips
 
 WEIGHTS = SHARED_DATA / "weights"
 FILES = {"alex": "alexnet_features.pth", "vgg": "vgg16_features.pth"}
@@ -157,15 +150,6 @@ def clock(monkeypatch):
     return now
 
 
-def test_cached_lpips_is_loaded_once_for_each_device_and_gives_what_load_lpips_gives(
-    alex_file, alex, clock, monkeypatch
-):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
-    assert cached_lpips("alex", "cpu") is cached_lpips("alex", torch.device("cpu"))
-    assert torch.equal(cached_lpips("alex", "cpu")(*pair(40, 40)), alex(*pair(40, 40)))
-    assert {buffer.device.type for buffer in cached_lpips("alex", "meta").buffers()} == {"meta"}
-
-
 # In a report
 
 
@@ -179,16 +163,6 @@ def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex,
 
 
 # Where the weights come from
-
-
-def test_a_file_or_folder_that_is_named_alone_is_tried(alex_file, tmp_path, monkeypatch, nowhere):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
-    with pytest.raises(LpipsUnavailable, match=r"none\.pth: no such file"):
-        load_lpips("alex", tmp_path / "none.pth")
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
-    with pytest.raises(LpipsUnavailable, match=f"gone: no such file or folder, though {WEIGHTS_VARIABLE} names it"):
-        load_lpips()
-    assert not nowhere
 
 
 @pytest.mark.parametrize(
@@ -270,7 +244,16 @@ def test_files_that_are_no_backbone_are_said(tmp_path, content, message):
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("load", [load_lpips, lambda net: cached_lpips(net, "cpu")])
-def test_an_unknown_network_is_said(load, clock):
+def test_a_file_or_folder_that_is_named_alone_is_tried(alex_file, tmp_path, monkeypatch, nowhere):
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
+    with pytest.raises(LpipsUnavailable, match=r"none\.pth: no such file"):
+        load_lpips("alex", tmp_path / "none.pth")
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "gone"))
+    with pytest.raises(LpipsUnavailable, match=f"gone: no such file or folder, though {WEIGHTS_VARIABLE} names it"):
+        load_lpips()
+    assert not nowhere
+
+
+def test_an_unknown_network_is_said():
     with pytest.raises(LpipsUnavailable, match="no LPIPS network is called 'squeeze'; expected one of alex, vgg"):
-        load("squeeze")
+        load_lpips("squeeze")

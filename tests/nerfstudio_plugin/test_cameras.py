@@ -1,17 +1,26 @@
-"""nerfstudio's cameras and ours are the same cameras."""
+"""Cameras, views of a dataset and the data manager."""
 
 import copy
 import dataclasses
+import json
+from pathlib import Path
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
+import pointsplat_ns as ps
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, eps2d_of, near_plane_of, views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
+from pointsplat_ns.tradeoff import machine, outputs
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
 SEED = 20
+
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
@@ -61,13 +70,6 @@ def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_pla
         assert eps2d_of(some) == eps2d == views_of_cameras(some, BACKGROUND).eps2d
 
 
-def test_cameras_of_a_dataset_have_gsplats_near_plane(views):
-    assert near_plane_of(some_cameras()) == views.near_plane == NEAR_PLANE
-    with_others = some_cameras()
-    with_others.metadata = {"cam_idx": 1}
-    assert near_plane_of(with_others) == NEAR_PLANE and eps2d_of(with_others) == EPS2D
-
-
 def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
     cameras = cameras_of_views(views)
     cameras.metadata["near_plane"] = torch.tensor([[0.1], [0.1], [0.2]])
@@ -77,3 +79,64 @@ def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
     cameras.width = torch.tensor([[40], [41], [40]])
     with pytest.raises(DataError, match="photos of 2 sizes; expected one size for all views"):
         views_of_cameras(cameras, BACKGROUND)
+
+
+def datamanagers(wall_scene, **settings):
+    parser = ReplicaDataParserConfig(data=wall_scene, load_seed_points=False, eval_every=3)
+    lazy = LazyImageDatamanagerConfig(dataparser=parser, **settings).setup(device="cpu")
+    stock = FullImageDatamanagerConfig(dataparser=parser, cache_images_type="uint8").setup(device="cpu")
+    return lazy, stock
+
+
+def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
+    lazy, stock = datamanagers(wall_scene, cache_gigabytes=3e-5)  # room for three photos
+    for step in range(2 * len(lazy.train_dataset) + 1):
+        (camera, data), (other, expected) = lazy.next_train(step), stock.next_train(step)
+        assert data["image_idx"] == expected["image_idx"] == camera.metadata["cam_idx"]
+        assert torch.equal(data["image"], expected["image"])
+        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
+        assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
+    assert lazy.frame_cache.num_bytes <= 3e4
+    assert lazy.get_train_rays_per_batch() == stock.get_train_rays_per_batch()
+    ours, theirs = list(lazy.fixed_indices_eval_dataloader), list(stock.fixed_indices_eval_dataloader)
+    assert len(ours) == len(theirs) == len(lazy.fixed_indices_eval_dataloader) > 1
+    for (camera, data), (other, expected) in zip(ours, theirs, strict=True):
+        assert torch.equal(data["image"], expected["image"])
+        assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
+    seen = [lazy.next_eval(step)[1]["image_idx"] for step in range(len(ours))]
+    assert sorted(seen) == list(range(len(ours)))
+    assert [d["image_idx"] for d in lazy.cached_train] == list(range(len(lazy.train_dataset)))
+    assert torch.equal(lazy.cached_eval[1]["image"], theirs[1][1]["image"])
+
+
+@pytest.fixture()
+def run(trained_walls) -> Path:
+    """The run of SH degree 1 over white."""
+    (config,) = (trained_walls / "wall-b").rglob("config.yml")
+    return config.parent
+
+
+def test_photos_come_with_the_views_that_they_show(run):
+    """What a camera of these views sees of a wall with the photos' colours: the middle pixel of each photo."""
+    views, photos = dataset_photos(run, "test", 100)
+    poses = ps.dataset_views(run, "test")
+    assert len(views) == len(photos) == len(poses)
+    assert torch.allclose(views.viewmats, poses.viewmats, atol=1e-6) and torch.allclose(views.Ks, poses.Ks)
+    assert all(photo.shape == (views.height, views.width, 3) for photo in photos)
+    assert all(0 <= float(photo.min()) and 0.5 < float(photo.max()) <= 1 for photo in photos)
+    assert torch.equal(views.background, poses.background) and views.rasterize_mode == "antialiased"
+
+
+def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
+    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
+    found = ps.measure_tradeoff(run, tmp_path / "trade", points=2, repairs=("none",))
+    dense, small = found.points
+    views, photos = dataset_photos(run, "test", 10)
+    scene = ps.load(run)
+    errors = [ps.psnr(ps.render(scene, view), photo) for view, photo in zip(views, photos, strict=True)]
+    assert dense.against_photos.psnr == pytest.approx(float(torch.stack(errors).mean()), abs=1e-4)
+    assert small.against_photos is not None and small.gaussians < dense.gaussians
+    assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
+    written = json.loads((tmp_path / "trade" / "tradeoff.json").read_text())
+    assert written["points"][0]["against_photos"]["psnr"] == dense.against_photos.psnr

@@ -1,6 +1,8 @@
-"""Captures in every layout that people have, read by nerfstudio's dataparsers and trained on by both methods."""
+"""Captures of all kinds."""
 
 import dataclasses
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +14,11 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
 from nerfstudio.engine.trainer import Trainer
 
-from captures import BAD, FRAMES, SEEDS, Capture, Lens, colors_at, seen_from
-from making import pipeline_of
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from captures import BAD, FRAMES, HELD_OUT, SEEDS, Capture, Lens, colors_at, seen_from
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
@@ -131,18 +133,80 @@ def test_a_scene_starts_from_the_points_of_the_capture_and_learns(trained):
     assert trained.trainer.pipeline.model.num_points == SEEDS
 
 
-def test_a_refiner_trains_on_the_same_photos(trained):
-    pipeline = pipeline_of(trained.run).train()
-    frames = pipeline.datamanager.next_train(0)[1]
-    assert all(wrongness(frame, trained.outputs) < trained.layout.wrong for frame in frames)
-    _, losses, metrics = pipeline.get_train_loss_dict(0)
-    losses["l1"].backward()
-    assert losses["l1"].isfinite() and metrics["faults"] == []
-    assert any(p.grad is not None and p.grad.any() for p in pipeline.model.refiner.parameters())
+TRANSFORMS = "dslr/nerfstudio/transforms.json"
 
 
-def test_views_of_the_dataset_are_those_of_the_undistorted_photos(trained):
-    views = dataset_views(trained.run)
-    cameras = [camera for camera, _ in trained.trainer.pipeline.datamanager.train_frames]
-    assert torch.equal(views.Ks, torch.cat([camera.get_intrinsics_matrices() for camera in cameras]))
-    assert all((int(camera.width), int(camera.height)) == (views.width, views.height) for camera in cameras)
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return Capture(FISHEYE).write_scannetpp(tmp_path_factory.mktemp("scannetpp") / "0a5c013435")
+
+
+@pytest.fixture
+def own_scene(scene, tmp_path) -> Path:
+    """A copy to change."""
+    return Path(shutil.copytree(scene, tmp_path / "scene"))
+
+
+def parsed(scene: Path, split: str = "train", **settings) -> DataparserOutputs:
+    return SeededScanNetppDataParserConfig(data=scene, **settings).setup().get_dataparser_outputs(split)
+
+
+def numbers(outputs: DataparserOutputs) -> list[int]:
+    return [int(path.stem) for path in outputs.image_filenames]
+
+
+def test_bad_frames_are_left_out_of_both_splits_with_their_masks_and_cameras(scene):
+    for split, wanted in (("train", set(range(FRAMES)) - set(HELD_OUT)), ("test", set(HELD_OUT))):
+        ours, every = parsed(scene, split), ScanNetppDataParserConfig(data=scene).setup().get_dataparser_outputs(split)
+        assert numbers(ours) == sorted(wanted - set(BAD)) and len(numbers(every)) == len(numbers(ours)) + 1
+        assert [path.stem for path in ours.mask_filenames] == [path.stem for path in ours.image_filenames]
+        kept = [numbers(every).index(number) for number in numbers(ours)]
+        assert torch.equal(ours.cameras.camera_to_worlds, every.cameras.camera_to_worlds[kept])
+        assert torch.equal(ours.dataparser_transform, every.dataparser_transform)
+        assert numbers(parsed(scene, split, skip_bad=False)) == numbers(every)
+
+
+@pytest.mark.parametrize("gone", ["folder", "points"])
+def test_without_points_training_starts_from_random_ones(own_scene, gone, capsys):
+    if gone == "folder":
+        shutil.rmtree(own_scene / "dslr/colmap")
+    else:
+        (own_scene / "dslr/colmap/points3D.txt").write_text("# none\n")
+    assert "points3D_xyz" not in parsed(own_scene).metadata
+    assert "starts from random ones" in " ".join(capsys.readouterr().out.split())
+
+
+def spoil_pose(scene: Path) -> None:
+    meta = json.loads((scene / TRANSFORMS).read_text())
+    meta["frames"][4]["transform_matrix"][1][3] += 0.1
+    (scene / TRANSFORMS).write_text(json.dumps(meta))
+
+
+def mark_all(scene: Path) -> None:
+    meta = json.loads((scene / TRANSFORMS).read_text())
+    meta["frames"] = [{**frame, "is_bad": True} for frame in meta["frames"]]
+    (scene / TRANSFORMS).write_text(json.dumps(meta))
+
+
+def rename_photos(scene: Path) -> None:
+    path = scene / "dslr/colmap/images.txt"
+    path.write_text(path.read_text().replace(".png", ".jpg"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (spoil_pose, "poses of 10 photos are not those of transforms.json.*--load-seed-points False"),
+        (rename_photos, "knows none of the 10 photos by name"),
+        (mark_all, "all 7 frames of the train split are marked is_bad.*--skip-bad False"),
+        (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
+        (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
+        (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*test_frames"),
+        (lambda scene: (scene / TRANSFORMS).write_text("{}"), "KeyError: 'frames'; expected JSON with frames"),
+        (lambda scene: (scene / TRANSFORMS).write_text("{"), "transforms.json: JSONDecodeError"),
+    ],
+)
+def test_what_cannot_be_used_is_named(own_scene, spoil, message):
+    spoil(own_scene)
+    with pytest.raises(DataError, match=message):
+        parsed(own_scene)

@@ -92,12 +92,6 @@ def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distort
         assert torch.equal(camera.camera_to_worlds, theirs.camera_to_worlds)
 
 
-def test_a_lower_resolution_scales_photo_and_camera_together(tmp_path):
-    camera, data = Frames(make_dataset(tmp_path, scale=0.5, masks=True))[3]
-    assert data["image"].shape == (HEIGHT // 2, WIDTH // 2, 3) and data["mask"].shape == (HEIGHT // 2, WIDTH // 2, 1)
-    assert float(camera.fx) == 17.5 and int(camera.width) == WIDTH // 2
-
-
 def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_path):
     image = Frames(make_dataset(tmp_path), image_type="float32")[0][1]["image"]
     assert image.dtype == torch.float32 and 0 <= image.min() and image.max() <= 1
@@ -193,31 +187,6 @@ def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
 @dataclass(frozen=True)
 class Name(CacheKey[str]):
     number: int
-
-
-GET = None
-"""In place of a value and its size: the key is only asked for."""
-
-
-@pytest.mark.parametrize(
-    ("limit", "steps", "kept", "size"),
-    [
-        (10, [(1, ("a", 4)), (2, ("b", 3))], {1: "a", 2: "b"}, 7),
-        (10, [(1, ("old", 4)), (1, ("new", 6))], {1: "new"}, 6),
-        (3, [(1, ("a", 1)), (2, ("b", 1)), (3, ("c", 1)), (1, GET), (4, ("d", 1))], {1: "a", 3: "c", 4: "d"}, 3),
-        (10, [*((number, ("a", 2)) for number in range(5)), (9, ("large", 5))], {3: "a", 4: "a", 9: "large"}, 9),
-        (10, [(1, ("small", 4)), (2, ("too large", 11))], {1: "small"}, 4),
-        (10, [(1, ("old", 4)), (1, ("grown too large", 11))], {}, 0),
-        (0, [(1, ("a", 1))], {}, 0),
-    ],
-    ids=["sum", "again", "longest unused", "as many as needed", "too large", "grown", "no room"],
-)
-def test_what_is_kept_within_the_limit_and_its_size(limit, steps, kept, size):
-    cache = MemoryCache(limit)
-    for number, step in steps:
-        cache.get(Name(number)) if step is GET else cache.put(Name(number), *step)
-    assert {number: value for number in range(10) if (value := cache.get(Name(number)))} == kept
-    assert (cache.num_bytes, len(cache)) == (size, len(kept))
 
 
 def test_the_bound_holds_while_many_threads_put_and_get():

@@ -1,13 +1,23 @@
-"""How the package enters nerfstudio's commands."""
+"""Registration, options and warnings."""
 
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.metrics import structural_similarity
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig
 from pointsplat_ns.nerfstudio_plugin.registration import load_specification
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
+from pointsplat_ns.nerfstudio_plugin.third_party_warnings import NERFSTUDIO, quiet_nerfstudio
+from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
+from pointsplat_ns.system import threads
 
 FORKED = """
 import importlib, os, sys, traceback, warnings
@@ -122,3 +132,98 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     assert bug.returncode == 1 and "Traceback" in bug.stderr and "a bug" in bug.stderr
     methods = Path(__file__).parents[2] / "method_configs" / "methods.py"
     assert "errors_in_one_line()" in methods.read_text()
+
+
+@pytest.fixture
+def three_threads(monkeypatch):
+    """Three threads and cores, which stall."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(threads, "cores", lambda: 3)
+    monkeypatch.setattr(threads.machine, "stalls", lambda count: True)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("count", "used"), [(None, 1), (2, 2)])
+def test_steps_use_the_threads_chosen_or_set(
+    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, count, used
+):
+    seen = set()
+
+    def one_step(trainer, step):
+        seen.add(torch.get_num_threads())
+        return torch.zeros(()), {}, {}
+
+    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
+    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
+    config = wall_config(wall_scene, tmp_path, 3)
+    config.threads, config.early_look = count, False
+    config.steps_per_eval_image = 0
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.callbacks = []  # they need what a real step leaves
+    trainer.train()
+    assert seen == {used}
+    assert torch.get_num_threads() == 3
+    trainer.config.threads = 0
+    with pytest.raises(PointSplatError, match="0 threads"):
+        trainer.train()
+
+
+USED = {
+    "projection": projection,
+    "colours": colors,
+    "lists of tiles": tiles,
+    "blending": blending,
+    "SSIM": structural_similarity,
+}
+"""What a training of splatfacto-cpu uses, by its name in the log."""
+
+
+@pytest.fixture()
+def engine(monkeypatch):
+    """A function that gives the line where some kernels are missing."""
+
+    def line(config, **missing: str) -> str:
+        for module in USED.values():
+            name = module.__name__.rpartition(".")[2]
+            monkeypatch.setattr(module, "KERNELS", SimpleNamespace(why_missing=missing.get(name, "")))
+        return config.engine(torch.device("cpu"))
+
+    return line
+
+
+def test_a_training_is_compiled_if_all_that_it_uses_is_and_else_says_what_it_lacks_and_why(engine):
+    assert engine(SplatfactoCpuModelConfig()) == "rasterizer: compiled"
+    assert engine(PointSplatModelConfig(), structural_similarity="the disk is full") == "rasterizer: compiled"
+    for what, module in USED.items():
+        line = engine(SplatfactoCpuModelConfig(), **{module.__name__.rpartition(".")[2]: "the disk is full"})
+        assert line == f"rasterizer: compiled, but torch does {what}, which is slower: the disk is full"
+    missing = {module.__name__.rpartition(".")[2]: "there is no C++ compiler" for module in USED.values()}
+    slower = "rasterizer: torch, several times slower than compiled kernels: "
+    assert engine(SplatfactoCpuModelConfig(), **missing) == slower + "there is no C++ compiler"
+    left_out = engine(SplatfactoCpuModelConfig(compiled=False))
+    assert left_out == slower + "as --pipeline.model.compiled is False"
+
+
+def printed(text: str, category: type[Warning], module: str) -> list[str]:
+    """What is printed of a warning that is raised for a module after nerfstudio's are quieted."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        quiet_nerfstudio()
+        warnings.warn_explicit(text, category, "some.py", 1, module=module)
+    return [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("known", NERFSTUDIO, ids=lambda known: known.text[:30])
+def test_a_known_warning_is_not_printed_and_one_that_differs_in_anything_is(known):
+    assert printed(f"{known.text}, and more", known.category, known.module) == []
+    for other in (
+        ("another thing is deprecated", known.category, known.module),
+        (known.text, RuntimeWarning, known.module),
+        (known.text, known.category, "users.script"),
+        (known.text, known.category, f"{known.module}.more"),
+    ):
+        assert printed(*other) == [other[0]]

@@ -1,7 +1,6 @@
 """The ``replica-data`` dataparser and the Replica layout on disk: what is read, and what each fault says."""
 
 import json
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,7 @@ import torch
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.replica.dataparser import (
-    ReplicaDataParserConfig,
-    fuse_depth,
-    read_eval_list,
-    voxel_thin,
-)
+from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig, fuse_depth, read_eval_list
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from replica_scenes import CAMERA, line_of, write_scene
 
@@ -198,24 +192,6 @@ def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, wo
     assert all(some in str(caught.value) for some in words) and "\n" not in str(caught.value), caught.value
 
 
-@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 -1e300 0 1 0 0 0 0 1 0 0 0 0 1",
-                                  "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])  # fmt: skip
-def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(scene, caplog, lost):
-    edit_line(scene, 2, lost)
-    with caplog.at_level(logging.WARNING):
-        loaded = load_replica(scene)
-    assert loaded.numbers == (0, 2, 3) and np.isfinite(loaded.poses.astype(np.float32)).all()
-    assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text
-
-
-def test_small_drift_is_removed(scene):
-    pose = np.eye(4)
-    pose[:3, :3] += 1e-3
-    edit_line(scene, 2, line_of(pose))
-    rotation = load_replica(scene).poses[1, :3, :3]
-    assert np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)  # float64 SVD
-
-
 def test_pictures_of_another_kind_and_broken_ones_are_refused(scene):
     loaded = load_replica(scene)
     Image.fromarray(np.full((6, 8), 300, np.uint16)).save(loaded.photos[1])  # 300 modulo 256 is nearly black
@@ -247,16 +223,3 @@ def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     xyz, _ = fuse_depth(scene, 1000, scene.params.principal_point())
     # Lost: the columns on both sides of the step, the unknown pixel and its two other neighbours.
     assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
-
-
-def test_thinning_is_even_bounded_and_keeps_means():
-    rng = np.random.default_rng(3)
-    # A plane whose left half was seen 20 times as often as its right half.
-    dense, sparse = rng.uniform((-1, -1), (0, 1), (40_000, 2)), rng.uniform((0, -1), (1, 1), (2_000, 2))
-    xyz = np.concatenate([dense, sparse])
-    xyz = np.concatenate([xyz, np.zeros((len(xyz), 1))], axis=1).astype(np.float32)
-    points, colors = voxel_thin(xyz, np.full((len(xyz), 3), 77, np.uint8), 400)
-    assert 350 < len(points) <= 400  # the voxel size is bisected to 1 %, one step of whole columns is 5 %
-    left = int((points[:, 0] < 0).sum())
-    assert abs(left - len(points) / 2) < 0.1 * len(points)
-    assert np.all(colors == 77) and np.all(points[:, 2] == 0)

@@ -1,32 +1,26 @@
-"""Which trainings have finished, and the command lines of trainings and evaluations."""
+"""Commands of nerfstudio that the lab runs."""
 
-import shlex
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
-from making import parsed_by_ns_train, write_run
+import pointsplat_ns as ps
+from making import write_run
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.running import (
-    evaluate_command,
-    folder_of_run,
     has_finished,
     remove_interrupted,
-    train_refiner_command,
-    train_scene_command,
 )
+from pointsplat_ns.tables import outputs
+from pointsplat_ns.tradeoff import machine
 
 
 def files(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize(("steps", "planned", "wanted"), [(30, 30, 30), (12, 30, 30), (12, 30, 12)])
-def test_asking_whether_a_training_has_finished_changes_nothing(steps, planned, wanted, tmp_path):
-    write_run(tmp_path, steps, planned)
-    before = files(tmp_path)
-    assert has_finished(tmp_path, wanted) == (steps == planned)
-    assert before == files(tmp_path) and len(before) == 2
 
 
 def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpoint_has_not_finished(tmp_path):
@@ -39,44 +33,36 @@ def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpo
     remove_interrupted(tmp_path / "nothing")
 
 
-def test_only_an_interrupted_training_is_removed(tmp_path):
-    done, stopped = tmp_path / "done", tmp_path / "stopped"
-    write_run(done, 30, 30)
-    write_run(stopped, 12, 30)
-    remove_interrupted(stopped)
-    assert not stopped.exists()
-    with pytest.raises(SceneError, match="holds a finished training"):
-        remove_interrupted(done)
-    assert len(files(done)) == 2
+def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
+    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    (config,) = (trained_walls / "wall-b").rglob("config.yml")
+    only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]
+    [group] = ps.measure_tables([config.parent], tmp_path / "tables", only=only, fine_tune=8)
+    [scene] = group.scenes
+    views, photos = dataset_photos(config.parent, "test", 10)
+    dense = ps.load(config.parent)
+    errors = torch.stack([ps.psnr(ps.render(dense, view), photo) for view, photo in zip(views, photos, strict=True)])
+    points = {way: cell.point for (way, _), cell in scene.cells.items()}
+    assert points["dense"].against_photos.psnr == pytest.approx(float(errors.mean()), abs=1e-4)
+    assert points["lightgaussian-tuned"].against_photos.psnr > points["lightgaussian"].against_photos.psnr
+    assert points["lightgaussian-tuned"].against_dense.psnr < 100 and scene.about.origin == "held-out photos"
+    assert scene.about.dataset == "" and group.name == "scenes"
+    written = json.loads((tmp_path / "tables" / "tables.json").read_text())
+    assert written["cells"][0]["point"]["against_photos"]["psnr"] == points["dense"].against_photos.psnr
 
 
-def test_a_run_that_does_not_say_how_long_it_was_to_be_is_kept(tmp_path):
-    write_run(tmp_path, 30, 30)
-    config = tmp_path / "config.yml"
-    config.write_text(config.read_text().replace("max_num_iterations: 30\n", ""))
-    assert has_finished(tmp_path, 30)
-    with pytest.raises(SceneError, match="holds a finished training"):
-        remove_interrupted(tmp_path)
+def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames: int = 2000) -> SimpleNamespace:
+    """A run of a scene in the Replica layout whose photos are empty files."""
+    scene = folder / name
+    (scene / "results").mkdir(parents=True)
+    for number in range(frames):
+        (scene / "results" / f"frame{number:06d}.jpg").touch()
+    (scene / "traj.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * frames)
+    camera = {"w": size[0], "h": size[1], "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
+    (scene / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return run(scene, "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig")
 
 
-def test_the_command_of_a_scene_says_what_was_asked_for():
-    config = parsed_by_ns_train(train_scene_command(Path("my rooms/a"), Path("my scenes"), "a", 30, "now", 500))
-    assert (config.method_name, config.max_num_iterations, config.data) == ("splatfacto-cpu", 30, Path("my rooms/a"))
-    assert config.pipeline.datamanager.dataparser.num_seed_points == 500
-    assert config.get_base_dir() == folder_of_run(Path("my scenes"), "a", "splatfacto-cpu", "now")
-
-
-def test_the_command_of_a_refiner_says_what_was_asked_for():
-    options = {"pipeline.model.more-keeps": (0.25, 40.0), "pipeline.model.augment": True, "rate-factor": 2.5}
-    command = train_refiner_command(Path("my scenes"), Path("out"), "r", 30, "now", ("a", "b"), options)
-    config = parsed_by_ns_train(command)
-    assert (config.method_name, config.max_num_iterations, config.rate_factor) == ("pointsplat", 30, 2.5)
-    assert config.pipeline.datamanager.eval_scenes == ("a", "b") and config.data == Path("my scenes")
-    assert config.pipeline.model.more_keeps == (0.25, 40.0) and config.pipeline.model.augment is True
-    assert config.get_base_dir() == folder_of_run(Path("out"), "r", "pointsplat", "now")
-
-
-def test_the_command_of_an_evaluation_quotes_its_paths():
-    words = shlex.split(evaluate_command(Path("a run"), Path("an evaluation.json"), Path("pictures")))
-    assert words[:3] == ["ns-eval", "--load-config", "a run/config.yml"]
-    assert words[3:] == ["--output-path", "an evaluation.json", "--render-output-path", "pictures"]
+def run(data: Path, parser: str) -> SimpleNamespace:
+    return SimpleNamespace(data=data, dataparser_class=parser)

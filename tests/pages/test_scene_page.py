@@ -1,22 +1,26 @@
-"""The page of one or two scenes as a file: what is in it, how large it is, and what cannot be shown."""
+"""The page of a scene and its pictures."""
 
 import base64
+import io
 import logging
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from making import ball, box_room
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.looking.poses import in_pictures, look_at
-from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.pages.flight import FlightFrame
+from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -61,12 +65,6 @@ def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
     assert len(parts.inside["script"]) == 2 and all("onerror" not in attributes for _, attributes in parts.elements)
     assert [scene["name"] for scene in parts.data["flight"]["scenes"]] == [HOSTILE] * 2
     assert HOSTILE not in text and "<script>alert" not in text
-
-
-def test_one_scene_has_the_name_of_the_file_and_no_wipe(tmp_path):
-    text = ps.write_page(ball(50), tmp_path / "my ball.html").read_text("utf-8")
-    assert "<h1>my ball</h1>" in text and "<strong>my ball</strong> <span>50 Gaussians" in text
-    assert 'data-flight="wipe"' not in text and "<kbd>[</kbd>" not in text
 
 
 def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms, tmp_path, caplog):
@@ -157,28 +155,69 @@ def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     assert turned.up.direction.tolist() == [0.0, 0.0, -1.0]
 
 
-@pytest.mark.parametrize(
-    ("up", "rolled", "sure"), [(None, None, False), ("z", None, True), (None, 0.0, False), (None, 0.05, True)]
-)
-def test_page_says_where_up_is_a_guess_and_how_to_turn_the_scene(up, rolled, sure, tmp_path, monkeypatch):
-    """Cameras that people held are not exactly level, and tell what is up."""
-    guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
-    monkeypatch.setattr("pointsplat_ns.looking.sampling.pointing_up", lambda *_: guess)
-    views = None
-    if rolled is not None:
-        views = ball_seen_from([[3.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
-        roll = torch.tensor([[math.cos(rolled), -math.sin(rolled)], [math.sin(rolled), math.cos(rolled)]])
-        views.viewmats[:, :2] = roll @ views.viewmats[:, :2]
-    text = ps.write_page(ball(50), tmp_path / "page.html", views=views, up=up).read_text("utf-8")
-    assert ("Which way is up is a guess." in text and "--up=-y" in text) is not sure
-    assert parts_of(tmp_path / "page.html").data["flight"]["sure"] is sure
-
-
-def test_an_up_that_is_no_axis_is_refused(tmp_path):
-    with pytest.raises(ps.PointSplatError, match="expected x, y, z, -x, -y or -z"):
-        ps.write_page(ball(50), tmp_path / "page.html", up="down")
-
-
 def test_the_same_scenes_give_the_same_page(written, rooms, tmp_path):
     again = ps.write_page(rooms, tmp_path / "room.html", ["dense", "compact"], views=room_views())
     assert again.read_bytes() == written.read_bytes()
+
+
+SEED = 3
+
+noise = np.random.default_rng(SEED).integers(0, 256, (12, 48, 64, 3), dtype=np.uint8)
+
+
+def decoded(uri: str) -> Image.Image:
+    kind, content = uri.split(",", 1)
+    assert kind == "data:image/webp;base64"
+    return Image.open(io.BytesIO(base64.b64decode(content, validate=True)))
+
+
+def test_a_png_is_read_exactly(tmp_path):
+    Image.fromarray(noise[0]).save(tmp_path / "a.png")
+    assert np.array_equal(read_png(tmp_path / "a.png", 64, 48), noise[0])
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [(None, "No such file"), (b"GIF89a", "not a PNG"), ("cut", "cannot be read"), ("wide", "48 x 64")],
+)
+def test_a_picture_that_cannot_be_used_is_one_line_with_its_path(tmp_path, content, found):
+    path = tmp_path / "a.png"
+    if content == "wide":
+        Image.fromarray(noise[0].transpose(1, 0, 2)).save(path)
+    elif content == "cut":
+        Image.fromarray(noise[0]).save(path)
+        path.write_bytes(path.read_bytes()[:200])
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError) as error:
+        read_png(path, 64, 48)
+    text = str(error.value)
+    assert text.startswith(str(path)) and found in text and "expected a PNG picture of 64 x 48" in text
+    assert "\n" not in text
+
+
+def test_an_error_map_shows_the_mean_of_the_largest_difference_amplified():
+    picture = noise[0].copy()
+    other = picture.astype(int)
+    other[:2, :2, 0] += np.array([[8, 4], [0, 0]]) * np.where(picture[:2, :2, 0] < 128, 1, -1)
+    other[:2, :2, 2] += np.array([[2, 2], [2, 2]]) * np.where(picture[:2, :2, 2] < 128, 1, -1)
+    shown = error_map(other.astype(np.uint8), picture)
+    assert shown.shape == (24, 32, 3)
+    assert np.array_equal(shown[0, 0], error_colors()[round(ERROR_GAIN * (8 + 4 + 2 + 2) / 4)])
+    assert not shown[1:].any() and not shown[0, 1:].any()
+
+
+def test_pictures_are_kept_well_where_there_is_room():
+    uris, how = fit([lambda i=i: noise[i] for i in range(4)], 10**6)
+    assert [decoded(uri).size for uri in uris] == [(64, 48)] * 4 and how == "WebP of quality 90"
+
+
+def test_pictures_are_made_smaller_where_quality_alone_is_not_enough():
+    big = np.random.default_rng(SEED).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    [uri], how = fit([lambda: big], 45_000)
+    assert decoded(uri).size == (160, 120) and how.endswith("at most 160 pixels wide or high")
+
+
+def test_pictures_that_cannot_fit_are_an_error():
+    with pytest.raises(DataError, match="12 pictures do not fit into 0.0 MB"):
+        fit([lambda i=i: noise[i] for i in range(12)], 1_000)

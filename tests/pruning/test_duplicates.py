@@ -1,16 +1,18 @@
-"""Exact copies of Gaussians."""
+"""Exact copies, and SH bands."""
 
 import math
 
 import pytest
 import torch
 
-from making import cloud, same
+from making import cloud, normal_scene, same
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import duplicates
+from pointsplat_ns.pruning import band_energies, cut_sh, duplicates, energy_lost
 from pointsplat_ns.pruning.duplicates import Copies, stacked
-from pointsplat_ns.pruning.merging import merge, merge_levels
+from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 
 def with_zeros(n: int = 700, zeros: int = 300) -> tuple[Gaussians, torch.Tensor]:
@@ -80,13 +82,6 @@ def test_hashes_that_collide_make_no_copies_of_others(monkeypatch):
     assert Copies(Gaussians.cat([scene, scene[:1]]), torch.arange(51)).first.tolist() == [*range(50), 0]
 
 
-def test_copies_become_one_gaussian_and_do_not_crowd_out_the_others():
-    scene, zero = with_zeros()
-    merged = merge(scene, 100)
-    assert len(merged.scene) == 100
-    assert len(merged.assignment[zero].unique()) == 1
-
-
 @pytest.mark.parametrize("k", [701, 702, 850, 999])
 def test_the_count_is_exact_also_where_fewer_differ(k):
     scene, zero = with_zeros()
@@ -98,13 +93,55 @@ def test_the_count_is_exact_also_where_fewer_differ(k):
     assert len(firsts) == k - 700 and same(merged.scene[firsts[1:]], scene[zero][1 : len(firsts)])
 
 
-def test_levels_with_copies_are_nested_and_exact():
-    scene, _ = with_zeros()
-    counts = [990, 800, 701, 300, 20, 1]
-    levels = list(merge_levels(scene, counts))
-    assert [len(level.scene) for level in levels] == counts
-    for finer, coarser in zip(levels[:-1], levels[1:], strict=True):
-        parents = torch.full((len(finer.scene),), -1)
-        parents[finer.assignment] = coarser.assignment
-        assert torch.equal(parents[finer.assignment], coarser.assignment)
-    assert same(levels[3].scene, next(merge_levels(scene, counts[3:])).scene)
+def test_energies_are_mean_squares_over_the_sphere():
+    scene = normal_scene(20).to(torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
+    basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), 3)
+    area = scene.stds.sort(dim=1).values[:, 1:].prod(dim=1)
+    weights = scene.alphas * area / (scene.alphas * area).sum()
+    for degree, found in enumerate(band_energies(scene), start=1):
+        band = slice(degree**2, (degree + 1) ** 2)
+        colors = torch.einsum("dk,nkc->ndc", basis[:, band], scene.sh[:, band])
+        wanted = (weights * colors.square().mean(dim=(1, 2))).sum()
+        assert found == pytest.approx(float(wanted), rel=0.01)  # 200,000 directions: 0.5 % of noise
+
+
+def test_lost_shares_add_up():
+    scene = normal_scene(20)
+    energies = band_energies(scene)
+    lost = [energy_lost(scene, degree) for degree in range(4)]
+    assert lost[0] == pytest.approx(1.0) and lost[3] == 0.0
+    assert lost[1] == pytest.approx((energies[1] + energies[2]) / sum(energies))
+    assert lost[2] == pytest.approx(energies[2] / sum(energies))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_cutting_leaves_the_rest_bit_for_bit(degree):
+    scene = normal_scene(20)
+    cut = cut_sh(scene, degree)
+    assert cut.sh_degree == degree
+    assert torch.equal(cut.features_rest, scene.features_rest[:, : (degree + 1) ** 2 - 1])
+    assert all(torch.equal(a, b) for (name, a), (_, b) in zip(cut.items(), scene.items(), strict=True) if name != "features_rest")  # fmt: skip # noqa: E501
+
+
+@pytest.mark.parametrize("case", ["empty", "no colour", "invisible", "nan", "huge scales", "degree 0"])
+def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
+    scene = normal_scene(20)
+    scene = {
+        "empty": lambda: Gaussians.empty(3),
+        "no colour": lambda: scene.replace(features_rest=torch.zeros_like(scene.features_rest)),
+        "invisible": lambda: scene.replace(opacities=torch.full_like(scene.opacities, -math.inf)),
+        "nan": lambda: scene.map(lambda value: value * math.nan),
+        "huge scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 1e4)),
+        "degree 0": lambda: normal_scene(20, 0),
+    }[case]()
+    lost = energy_lost(scene, 0)
+    assert lost == pytest.approx(1.0) if case == "huge scales" else lost == 0.0
+
+
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_a_degree_that_is_none_is_said(degree):
+    for function in (cut_sh, energy_lost):
+        with pytest.raises(BudgetError, match=f"SH degree is {degree}; expected 0 to 3"):
+            function(normal_scene(20), degree)

@@ -1,21 +1,38 @@
-"""The registry of methods, and the one way through it: exact counts, what is kept, what is refused."""
+"""Methods and budgets."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from making import normal_scene, same
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import METHODS, Megabytes, PruneSettings, WithinPsnr, ply_bytes, prune, score_of, select
+from pointsplat_ns.pruning import (
+    METHODS,
+    Megabytes,
+    PruneSettings,
+    WithinPsnr,
+    parse_keep,
+    ply_bytes,
+    prune,
+    resolve_keep,
+    score_of,
+    select,
+)
 from pointsplat_ns.views import Views
 
 SCORES = [name for name, method in METHODS.items() if method.score and not method.needs_views]
+
 WITHOUT_VIEWS = [name for name, method in METHODS.items() if not method.needs_views]
+
 WITH_VIEWS = [name for name, method in METHODS.items() if method.needs_views]
+
 WITHOUT_OPACITY_WEIGHT = [name for name, method in METHODS.items() if not method.weighs_opacity]
+
 UNKNOWN = "no method is called 'best'; expected one of merge, coverage, paper, auth"
 
 
@@ -71,39 +88,11 @@ def test_a_score_from_views_keeps_the_highest_also_of_views_that_are_made_when_d
     assert torch.equal(kept(scene, 0.3, by, views=views), wanted)
 
 
-@pytest.mark.parametrize("by", WITHOUT_VIEWS)
-def test_views_are_not_made_for_a_method_that_needs_none(by):
-    def never():
-        raise AssertionError("views were made")
-
-    assert len(prune(normal_scene(60, 1), 0.3, by, views=never)) == 18
-
-
 @pytest.mark.parametrize("by", ["merge", *WITH_VIEWS])
 def test_progress_rises_to_one(by):
     shares = []
     prune(normal_scene(60, 1), 0.3, by, views=views(), progress=shares.append)
     assert shares and shares == sorted(shares) and shares[-1] == 1.0
-
-
-@pytest.mark.parametrize("by", WITHOUT_VIEWS)
-@pytest.mark.parametrize(
-    ("keep", "count"),
-    [(0.3, 18), (7, 7), (1, 1), (1.0, 60), ("10%", 6), ("0.3", 18), ("7", 7), ("1.0", 60), ("100MB", 60)],
-)
-def test_a_budget_gives_the_same_count_by_any_method_also_as_text(by, keep, count):
-    assert len(prune(normal_scene(60, 1), keep, by)) == count
-
-
-def test_a_size_keeps_as_many_as_fit_at_the_degree_of_the_scene():
-    assert len(prune(normal_scene(50, 1), Megabytes(ply_bytes(20, 1) / 1e6), "paper")) == 20
-
-
-@pytest.mark.parametrize("by", WITHOUT_VIEWS)
-@pytest.mark.parametrize("keep", [0, 0.0, 1.5, math.nan, 61, -1, "0%", "many", "61"])
-def test_a_budget_out_of_range_is_refused(by, keep):
-    with pytest.raises(BudgetError, match="keep is"):
-        prune(normal_scene(60, 1), keep, by)
 
 
 @pytest.mark.parametrize("keep", ["auto", "auto:35", WithinPsnr(35.0)])
@@ -143,23 +132,12 @@ def test_the_opacity_weight_reaches_the_score():
     assert torch.equal(kept(scene, 10, opacity_weight=1.0), most_opaque)
 
 
-def test_a_scene_in_a_graph_stays_in_it():
-    scene = normal_scene(60, 1).map(lambda value: value.requires_grad_())
-    prune(scene, 5, "paper").means.sum().backward()
-    assert scene.means.grad.sum() == 15  # 5 rows of 3 ones
-
-
 @pytest.mark.parametrize(("keep", "count"), [(0.3, 18), (1.0, 60), (1, 1), (7, 7), (7.0, 7)])
 def test_settings_prune_as_prune_does(keep, count):
     scene = normal_scene(60, 1)
     assert len(PruneSettings(keep).prune(scene)) == count
     with_options = PruneSettings(keep, "authors", opacity_weight=0.9).prune(scene)
     assert same(with_options, prune(scene, count, "authors", opacity_weight=0.9))
-
-
-@pytest.mark.parametrize(("keep", "kind"), [(5000.0, int), (1.0, float)])
-def test_settings_hold_a_count_as_an_int_and_one_as_the_ratio_that_it_was_written_as(keep, kind):
-    assert type(PruneSettings(keep).keep) is kind
 
 
 @pytest.mark.parametrize("keep", [0, -1, 0.0, 1.5, 7.25, math.nan, math.inf])
@@ -179,3 +157,112 @@ def test_settings_refuse_a_budget_that_is_neither_a_ratio_nor_a_count(keep):
 def test_settings_refuse_methods_and_options_that_prune_refuses_and_methods_that_need_views(by, weight, message):
     with pytest.raises(PointSplatError, match=message):
         PruneSettings(0.3, by, opacity_weight=weight)
+
+
+@pytest.mark.parametrize(
+    ("n", "keep", "k"),
+    [
+        (1000, 0.3, 300),
+        (1000, 1.0, 1000),
+        (1000, 1, 1),
+        (1000, 1000, 1000),
+        (3, 0.5, 2),  # a half goes up
+        (100, 0.29, 29),  # 0.29 * 100 is 28.999999999999996
+        (1000, 1e-9, 1),  # never nothing
+        (1000, np.int64(7), 7),
+        (1000, np.float32(0.5), 500),
+    ],
+)
+def test_a_float_is_a_ratio_and_an_int_is_a_count(n, keep, k):
+    result = resolve_keep(n, keep)
+    assert result == k and type(result) is int
+
+
+@pytest.mark.parametrize(
+    ("n", "keep", "message"),
+    [
+        *(
+            (1000, keep, f"keep is {keep!r}; expected a ratio above 0 and up to 1.0")
+            for keep in (0.0, -0.1, 1.0001, math.nan, math.inf, -math.inf, b"0.5", None, True)
+        ),
+        *((1000, keep, f"keep is {keep} Gaussians; expected 1 to 1000") for keep in (0, -1, 1001)),
+        *((1000, Megabytes(value), "keep is ") for value in (0.0, -1.0, math.nan, math.inf, 1e-6)),
+        *((0, keep, "holds no Gaussians") for keep in (1, 0.5, Megabytes(1.0))),
+        (1000, WithinPsnr(35.0), "found by rendering"),
+        (1000, Megabytes(1.0, ".sog"), "found by writing"),
+    ],
+)
+def test_a_budget_that_fits_no_count_of_the_scene_is_refused(n, keep, message):
+    with pytest.raises(BudgetError) as caught:
+        resolve_keep(n, keep)
+    assert message in str(caught.value)
+    assert not isinstance(keep, Megabytes) or "MB" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "keep"),
+    [
+        ("0.3", 0.3),
+        ("30%", 0.3),
+        ("1", 1),
+        (" 50000 ", 50000),
+        *((text, 1000) for text in ("1e3", "1k", "1,000", "0.001M", "1000 Gaussians", "1kgaussians", "1.0e3")),
+        ("12kb", Megabytes(0.012)),
+        ("5,000 B", Megabytes(0.005)),
+        ("1.5 MB.sog", Megabytes(1.5, ".sog")),
+        (" 0.5 mb ", Megabytes(0.5)),
+        ("12MB.SPZ", Megabytes(12.0, ".spz")),
+        ("auto", WithinPsnr(35.0)),
+        ("auto:32.5dB", WithinPsnr(32.5)),
+        ("auto:32.5.sog", WithinPsnr(32.5, ".sog")),
+        ("auto.spz", WithinPsnr(35.0, ".spz")),
+    ],
+)
+def test_a_typed_budget_keeps_its_kind(text, keep):
+    result = parse_keep(text)
+    assert result == keep and isinstance(result, type(keep))
+
+
+def test_few_gaussians_of_many_are_asked_about_unless_they_are_called_so():
+    for n, text, kept in ((5000, "10%", 500), (5000, "10gaussians", 10), (4999, "10", 10), (5000, "100", 100)):
+        assert resolve_keep(n, text) == kept
+    assert resolve_keep(5000, 10) == 10
+    wanted = r"keep is 10, of 5,000 Gaussians; did you mean 10%\? Write 10gaussians for so few"
+    with pytest.raises(BudgetError, match=wanted):
+        resolve_keep(5000, "10")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "half",
+        "%",
+        "1,00",
+        "0,3",
+        "0.3x",
+        "MB",
+        "xMB",
+        "12TB",
+        "1e999",
+        "0.5 gaussians",
+        "auto:",
+        "auto:0",
+        "auto:-3",
+        "auto:nan",
+        "auto:inf",
+    ]
+    + ["automatic"],
+)
+def test_a_typed_budget_that_is_none_is_refused(text):
+    with pytest.raises(BudgetError, match="expected a ratio"):
+        parse_keep(text)
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 10**7), st.integers(0, 3), st.floats(0.002, 3000))
+def test_a_size_keeps_as_many_as_fit_and_not_one_more(n, degree, megabytes):
+    k = resolve_keep(n, Megabytes(megabytes), degree)
+    limit = math.floor(megabytes * 1e6)
+    assert 1 <= k <= n and ply_bytes(k, degree) <= limit
+    assert k == n or ply_bytes(k + 1, degree) > limit

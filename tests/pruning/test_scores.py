@@ -1,14 +1,18 @@
-"""Equation 3 to the letter, at ordinary values and where exponentials overflow."""
+"""Scores, and exactly the K highest."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from making import normal_scene
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.pruning import METHODS, prune, score_of, select
+from pointsplat_ns.pruning.coverage import mass_shares
 from pointsplat_ns.pruning.scores import paper_score
 
 SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
@@ -40,30 +44,6 @@ def test_a_ball_outranks_a_pancake_of_smaller_volume_and_the_authors_score_ranks
     scene = normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1))
     volume, product = SCORES["paper"](scene), SCORES["authors"](scene)
     assert volume[2] > volume[1] > volume[0] and product[0] > product[1]
-
-
-@pytest.mark.parametrize("shift", [-80.0, 80.0, -1e4, 1e4])
-def test_log_scales_far_out_neither_overflow_nor_change_the_score(shift):
-    scene = normal_scene(50, 1, dtype=torch.float64)
-    # Powers of two keep the shifted log-scales exact enough: 1e4 leaves 12 digits of each, hence 1e-8.
-    moved = paper_score(scene.replace(scales=scene.scales + shift))
-    assert moved.isfinite().all() and torch.allclose(moved, paper_score(scene), atol=1e-8)
-
-
-@pytest.mark.parametrize("case", ["one", "same", "flat"])
-def test_without_variance_every_score_is_zero(case):
-    n = 1 if case == "one" else 6
-    scene = normal_scene(1, 1)[[0] * n]
-    if case == "flat":
-        scene = scene.replace(scales=torch.full((n, 3), -math.inf))
-    assert paper_score(scene).tolist() == [0.0] * n
-
-
-def test_flat_gaussians_have_no_volume():
-    scales = torch.zeros(3, 3)
-    scales[1, 2] = -math.inf
-    score = paper_score(normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1)))
-    assert score.isfinite().all() and int(score.argmin()) == 1
 
 
 @pytest.mark.parametrize("name", sorted(SCORES))
@@ -150,14 +130,6 @@ def test_no_score_of_what_can_be_drawn_is_nan(name, case):
     assert len(prune(scene, 7, name)) == 7
 
 
-@pytest.mark.parametrize("name", sorted(set(SCORES) - {"random"}))
-def test_float32_and_float64_rank_alike(name):
-    scene = normal_scene(300, 1)
-    single, double = SCORES[name](scene), SCORES[name](scene.to(torch.float64))
-    # Both are computed in float64 from the same values, positions in a grid of 2^20 cells included.
-    assert torch.allclose(single, double, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["paper", "authors", "opacity", "area", "log-volume"])
 def test_infinite_logits_keep_their_rank(name):
     scene = normal_scene(9, 1)
@@ -167,19 +139,87 @@ def test_infinite_logits_keep_their_rank(name):
     assert (score.diff() >= 0).all() and score[-1] > score[4] > score[0]
 
 
-@pytest.mark.parametrize("name", sorted(set(SCORES) - {"opacity", "random"}))
-def test_a_single_giant_is_found_and_leaves_the_others_apart(name):
-    scene = normal_scene(60, 1)
-    scene = scene.replace(scales=scene.scales.clone(), opacities=torch.zeros(60, 1))
-    scene.scales[17] = 80.0
-    score = SCORES[name](scene)
-    assert score.isfinite().all() and score[17] == score.max()
-    if name not in ("paper", "authors"):  # whose z-scores the giant does flatten: that is their formula
-        assert len(score.unique()) > 30
-
-
 @pytest.mark.parametrize("weight", [-0.1, 1.1, math.nan])
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.weighs_opacity])
 def test_an_opacity_weight_outside_its_range_is_refused(name, weight):
     with pytest.raises(ValueError, match="expected 0 to 1"):
         SCORES[name](normal_scene(50, 1), opacity_weight=weight)
+
+
+def by_sorting(scores, k):
+    """The definition: sort by (NaN last, score descending, index), take k, order by index."""
+    order = sorted(
+        range(len(scores)), key=lambda i: (math.isnan(scores[i]), -scores[i] if scores[i] == scores[i] else 0, i)
+    )
+    return sorted(order[:k])
+
+
+values = st.one_of(
+    st.floats(width=32), st.sampled_from([0.0, -0.0, 1.0, 2.0, math.nan, math.inf, -math.inf])
+)  # few values, so that ties are common
+
+
+@settings(max_examples=200)
+@given(st.lists(values, max_size=30).flatmap(lambda x: st.tuples(st.just(x), st.integers(0, len(x)))))
+def test_select_is_its_definition(case):
+    scores, k = case
+    found = select(torch.tensor(scores, dtype=torch.float64), k)
+    assert found.tolist() == by_sorting(scores, k) and found.dtype == torch.int64
+
+
+@pytest.mark.parametrize("k", [-1, 6])
+def test_more_or_fewer_than_there_are_is_said(k):
+    with pytest.raises(BudgetError, match=f"cannot select {k} of 5 Gaussians; expected 0 to 5"):
+        select(torch.zeros(5), k)
+
+
+def scene_at(means, log_scales=-3.0, logits=1.0):
+    n = len(means)
+    return Gaussians(
+        means=means,
+        scales=torch.as_tensor(log_scales).expand(n).reshape(n, 1).repeat(1, 3).float(),
+        quats=torch.ones(n, 4),
+        opacities=torch.as_tensor(logits).expand(n).reshape(n, 1).clone().float(),
+        features_dc=torch.zeros(n, 3),
+        features_rest=torch.zeros(n, 0, 3),
+    )
+
+
+def shares_by_definition(masses, run, first):
+    result = [0.0] * len(masses)
+    edges = sorted({0, *range(first, len(masses), run), len(masses)})
+    for begin, end in zip(edges, edges[1:], strict=False):
+        part = list(range(begin, end))
+        ranked = sorted(part, key=lambda i: (-masses[i], i))
+        total = sum(masses[i] for i in part)
+        for place, i in enumerate(ranked):
+            if total == 0:
+                result[i] = (len(part) - place) / len(part)
+            else:
+                result[i] = sum(masses[j] for j in ranked[place:]) / total
+    return result
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40), st.integers(1, 7), st.data())
+def test_mass_shares_are_their_definition(masses, run, data):
+    first = data.draw(st.integers(0, run - 1))
+    found = mass_shares(torch.tensor(masses, dtype=torch.float64).log(), run, first)
+    # 1e-12: sums of at most 7 numbers in float64, their logarithms included
+    wanted = torch.tensor(shares_by_definition(masses, run, first), dtype=torch.float64)
+    assert torch.allclose(found, wanted, rtol=0, atol=1e-12)
+
+
+def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
+    # A wall of large opaque Gaussians, and a far larger number of faint and small ones that make up another.
+    generator = torch.Generator().manual_seed(3)
+    big = torch.rand(400, 3, generator=generator) * torch.tensor([0.0, 1.0, 1.0])
+    small = torch.rand(1600, 3, generator=generator) * torch.tensor([0.0, 1.0, 1.0]) + torch.tensor([1.0, 0.0, 0.0])
+    scales = torch.cat([torch.full((400,), -2.0), torch.full((1600,), -5.0)])
+    logits = torch.cat([torch.full((400,), 2.0), torch.full((1600,), -1.0)]) + torch.randn(2000, generator=generator)
+    scene = scene_at(torch.cat([big, small]), scales, logits)
+    cell = (scene.means[:, 0] > 0.5) * 16 + (scene.means[:, 1] * 4).long().clamp_max(3) * 4
+    cell = cell + (scene.means[:, 2] * 4).long().clamp_max(3)
+    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
+    regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
+    assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20

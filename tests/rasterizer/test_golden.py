@@ -1,16 +1,18 @@
-"""Every path of the rasterizer against stored images and gradients of the float64 reference.
+"""Recorded pictures, and drawing a scene."""
 
-They catch what a comparison of two paths of today cannot: that both have changed, with torch or with us.
-"""
-
+import dataclasses
 import re
 
 import pytest
 import torch
 
 import golden
-from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.tiles import Footprints
+import pointsplat_ns as ps
+from making import assert_same_on_any_threads, box_room
+from pointsplat_ns.rasterizer import pixels_of, projection, rasterization
+from pointsplat_ns.rasterizer import scene as scene_module
+from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
+from pointsplat_ns.rasterizer.projection import project_scene
 
 F32, F64 = torch.float32, torch.float64
 
@@ -23,8 +25,8 @@ IMAGE_32 = 1e-5
 GRADIENT_32 = 1e-4
 """Of a gradient's norm, for float32: ten times what was seen; a gradient is a sum over pixels that partly cancel."""
 
-
 TORCH = {"compiled": False}
+
 PATHS = {
     "packed": TORCH,
     "dense": {"packed": False, **TORCH},
@@ -32,6 +34,7 @@ PATHS = {
     "compiled": {},  # where there is a compiler, in float32, of at most four channels
     "compiled in regions": {"memory_budget": 4000},
 }
+
 if torch.cuda.is_available():
     PATHS["CUDA"] = {"device": "cuda"}
 
@@ -46,12 +49,6 @@ def test_a_changed_file_has_a_written_reason():
     assert entries and entries[-1][0] == golden.digest(), "make it by tests/support/golden.py, which asks for a reason"
     assert all(len(reason) >= 20 for _, reason in entries)
     assert golden.GOLDEN.stat().st_size < 200_000
-
-
-def test_the_file_holds_the_scenes_and_they_show_something(stored):
-    assert stored.keys() == golden.SCENES.keys()
-    for name, scene in stored.items():
-        assert scene["alphas"].max() > 0.2 and all(scene[f"grad of {part}"].any() for part in golden.NAMES), name
 
 
 def draw(scene, shape, dtype, device="cpu", **options):
@@ -93,9 +90,53 @@ def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):
     compare(draw(stored[name], golden.SCENES[name], dtype, **options), stored[name], *tolerances)
 
 
-def test_a_small_budget_does_draw_in_regions(stored, monkeypatch):
-    regions = []
-    tiles = Footprints.tiles
-    monkeypatch.setattr(Footprints, "tiles", lambda self, region: regions.append(region) or tiles(self, region))
-    draw(stored["degree 1"], golden.SCENES["degree 1"], F32, memory_budget=4000, **TORCH)
-    assert len(set(regions)) > 1
+@pytest.fixture(scope="module")
+def room():
+    return box_room(0, 400)
+
+
+@pytest.fixture(scope="module")
+def views(room):
+    return ps.sample_views(room, 2, 48, 36)
+
+
+def test_quality_is_handed_on(room, views):
+    exact, fast = (ps.render(room, views[0], quality=quality) for quality in ("exact", "fast"))
+    psnr = float(ps.psnr(fast, exact))
+    assert 30 < psnr < 60, "nearly the same, and not the same"
+
+
+def test_a_view_goes_to_the_device_of_the_scene_in_the_precision_that_a_render_takes(room, views, monkeypatch):
+    given = []
+    monkeypatch.setattr(projection, "project", lambda *arguments, **_: given.extend(arguments))
+    view = dataclasses.replace(views[0], viewmat=views[0].viewmat.double(), K=views[0].K.double())
+    project_scene(room.to(device="meta"), view)  # a device that every machine has, for want of CUDA
+    *_, viewmat, K, width, height = given
+    assert (viewmat.device.type, viewmat.dtype) == ("meta", torch.float64), "places cameras far from the origin exactly"
+    assert (K.device.type, K.dtype) == ("meta", torch.float32) and (width, height) == (48, 36)
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype, compiled):
+    scene = room.to(dtype)
+    counted = scene.to(torch.promote_types(dtype, torch.float32))
+    tolerance = 1e-9 if dtype == torch.float64 else 1e-4
+    for view in views:
+        seen = project_scene(counted, view)
+        weights = sum_over_pixels(
+            seen, view.width, view.height, 1,
+            lambda block: torch.where(block.alpha > 0, block.alpha * block.before, 0.0).sum(-1, keepdim=True),
+        )  # fmt: skip
+        wanted = torch.zeros(len(scene), dtype=counted.dtype).index_add_(0, seen.ids, weights[:, 0])
+        with torch.no_grad():  # as it is where scenes are merged
+            pixels = pixels_of(scene, view, compiled)
+        assert pixels.dtype == counted.dtype and float(pixels.sum()) > 0.5 * view.width * view.height
+        torch.testing.assert_close(pixels, wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_pixels_are_the_same_on_any_threads_and_to_rounding_in_several_regions(room, views, monkeypatch):
+    whole = pixels_of(room, views[0])
+    assert_same_on_any_threads(lambda: [pixels_of(room, view) for view in views])
+    monkeypatch.setattr(scene_module, "MEMORY_BUDGET", 32 * 3000)
+    torch.testing.assert_close(pixels_of(room, views[0]), whole, rtol=1e-5, atol=1e-6)  # float32, in another order

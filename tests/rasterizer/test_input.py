@@ -1,14 +1,19 @@
-"""What the rasterizer takes: values without meaning are skipped or refused; any precision and memory layout will do."""
+"""What is given to the rasterizer."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from making import camera_askew, splats_in_view
+import pointsplat_ns as ps
+from making import camera_askew, cloud, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.drawing import Drawing
+from pointsplat_ns.rasterizer.tiles import Region
 
 F64 = torch.float64
+
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
 BAD = [
@@ -44,14 +49,6 @@ def test_what_has_no_meaning_is_skipped_and_counted_with_a_zero_gradient(dtype, 
         assert grad[len(BAD) :].any() or (sh_degree in (None, 0) and name == "quats"), name
 
 
-def test_a_bad_colour_out_of_sight_is_not_looked_at():
-    scene = splats_in_view(50, 11, scale=-2.5)
-    scene[0][0, 2], scene[4][0] = -5.0, math.nan
-    view, K = camera_askew()
-    image, _, meta = rasterization(*scene, view[None], K[None], 37, 29, sh_degree=3)
-    assert image.isfinite().all() and meta["skipped"] == 0
-
-
 @pytest.mark.parametrize("dtype,tolerance", [(torch.float16, 0.02), (torch.bfloat16, 0.15)])
 def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance):
     # A position is held to 2^-11 (float16) or 2^-8 (bfloat16) of itself: at x / z = 0.5 that is 0.02 and 0.15 of the
@@ -68,29 +65,6 @@ def test_half_precision_input_gives_a_picture_close_to_float32(dtype, tolerance)
     assert torch.equal(got, exact)  # nothing is computed in half precision
     for grad, leaf in zip(torch.autograd.grad(got.mean(), half), half, strict=True):
         assert grad.dtype == leaf.dtype == dtype and grad.isfinite().all() and grad.any()
-
-
-def test_non_contiguous_and_expanded_tensors():
-    scene = [t.float() for t in splats_in_view(50, 11, scale=-2.5)]
-    scene[1][:], scene[3][:] = scene[1][0], 0.7
-    view, K = (t.float()[None] for t in camera_askew())
-
-    def run(tensors):
-        leaves = [t.requires_grad_() for t in tensors]
-        image, _, _ = rasterization(*leaves, view, K, 37, 29, sh_degree=2)
-        return image, torch.autograd.grad(image.sum(), leaves)
-
-    strided = [
-        scene[0].T.contiguous().T, scene[1][:1].expand(50, 4), scene[2].repeat(1, 2)[:, ::2],
-        scene[3][:1].expand(50), scene[4].permute(2, 1, 0).contiguous().permute(2, 1, 0),
-    ]  # fmt: skip
-    strided[2] = torch.stack([scene[2], scene[2]], -1)[..., 0]
-    assert not any(t.is_contiguous() for t in strided)
-    image, grads = run([t.clone() for t in scene])
-    got, got_grads = run([t.detach() for t in strided])
-    assert (image - got).abs().max() < 1e-6  # a matrix product may sum strided rows in another order
-    for want, grad in zip(grads, got_grads, strict=True):
-        assert (want - grad).norm() <= 1e-4 * want.norm()
 
 
 @pytest.mark.parametrize(
@@ -140,3 +114,26 @@ def test_colours_up_to_the_largest_number_have_finite_gradients(value, sh_degree
     assert image.isfinite().all() and (value > 1e31) == (meta["skipped"] > 0)
     for grad in torch.autograd.grad(image.sum(), leaves):
         assert grad.isfinite().all()
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    return cloud(400)
+
+
+@pytest.fixture(scope="module", params=["classic", "antialiased"])
+def view(request, scene) -> ps.View:
+    """Neither side is a multiple of a tile's."""
+    sampled = ps.sample_views(scene, 1, 75, 53)[0]
+    return dataclasses.replace(sampled, background=torch.tensor([0.2, 0.4, 0.9]), rasterize_mode=request.param)
+
+
+@pytest.mark.parametrize("high", [1, 3, 7])
+def test_bands_are_the_rows_of_the_render(scene, view, high):
+    drawing = Drawing(scene, view)
+    bands = [
+        drawing.draw(Region(top, min(top + high, drawing.rows), 0, drawing.columns))
+        for top in range(0, drawing.rows, high)
+    ]
+    # The blocks of tiles differ, and with them the order of sums in float32.
+    torch.testing.assert_close(torch.cat(bands), ps.render(scene, view), rtol=0, atol=1e-5)

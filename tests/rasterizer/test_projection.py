@@ -94,35 +94,6 @@ def test_colours_and_their_gradients_are_gsplats(degree, stored):
         assert grads[0][1] is None  # a constant has no direction
 
 
-def test_compensation_stops_at_its_lower_bound_with_no_gradient_of_its_own():
-    means = torch.tensor([[0.0, 0, 3]], dtype=F64)
-    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=F64)
-    view, K, w, h = *camera_askew(), 37, 29
-    for size, bound in ((1e-30, True), (1e-4, True), (0.1, False)):
-        for dtype in (torch.float32, F64):
-            scales = torch.full((1, 3), size, dtype=dtype, requires_grad=True)
-            opacities = torch.tensor([0.9], dtype=dtype)
-            args = [t.to(dtype) for t in (means, quats)]
-            seen = project(*args, scales, 2.0 * opacities, view.to(dtype), K.to(dtype), w, h, antialiased=True)
-            (grad,) = torch.autograd.grad(seen.opacities.sum(), scales)
-            if bound:
-                torch.testing.assert_close(seen.opacities, 2 * 0.9 * torch.full_like(opacities, 0.005))
-                assert not grad.any()
-            else:
-                assert seen.opacities > 0.1 and grad.isfinite().all() and grad.any()
-
-
-def test_a_mirroring_focal_length_mirrors_the_image():
-    scene = make_scene(scale=-1.0)
-    view, K, w, h = *camera_askew(cx=18.5), 37, 29
-    mirrored = torch.diag(torch.tensor([-1.0, 1, 1], dtype=F64)) @ K
-    mirrored[0, 2] = w - K[0, 2]
-    one, other = project(*scene, view, K, w, h), project(*scene, view, mirrored, w, h)
-    assert torch.equal(one.ids, other.ids) and len(one.ids) > 15
-    torch.testing.assert_close(one.means2d[:, 0], w - other.means2d[:, 0])
-    torch.testing.assert_close(one.det, other.det)
-
-
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 1.0])
 def test_what_ends_a_thousandth_beside_the_outer_pixel_centres_is_left_out_and_what_reaches_them_is_not(opacity):
     # Points, which the low-pass of 0.3 pixels^2 makes discs; alpha is 1/255 at this distance from their centres.

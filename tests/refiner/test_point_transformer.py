@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner.config import preset
 from pointsplat_ns.refiner.encoder import BatchNorm, SceneNorm
-from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, PointTransformer, SubmanifoldConv
+from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, SubmanifoldConv
 from pointsplat_ns.refiner.structure import build_structure
 
 
@@ -116,41 +116,3 @@ def test_scene_norm_at_extremes_follows_float64(offset, spread):
         results.append(out.double())
     # at 1e4 float32 steps are a thousandth of the spread, and the mean is known to a few of them
     assert (results[0] - results[1]).abs().max() < 2e-2
-
-
-def test_batch_norm_statistics_are_averages_at_first_so_that_short_trainings_evaluate_well():
-    norm = BatchNorm(2)
-    batches = [torch.randn(50, 2, generator=seeded(i)) + 10 for i in range(5)]
-    for batch in batches:
-        norm(batch)
-    assert torch.allclose(norm.running_mean, torch.stack([b.mean(0) for b in batches]).mean(0), rtol=1e-5)
-    assert torch.allclose(norm.running_var, torch.stack([b.var(0) for b in batches]).mean(0), rtol=1e-5)
-
-
-def test_full_preset_has_the_published_stages():
-    backbone = PointTransformer(32, preset("full"))
-    assert [len(stage.blocks) for stage in backbone.encoder] == [2, 2, 2, 4, 2]
-    assert [len(stage.blocks) for stage in backbone.decoder] == [2, 2, 2, 2]
-    assert [stage.blocks[0].attention.heads for stage in backbone.encoder] == [2, 4, 8, 16, 32]
-    assert [stage.blocks[0].norm1.normalized_shape[0] for stage in backbone.decoder] == [96, 96, 128, 256]
-    assert backbone.encoder[-1].blocks[-1].drop_path == pytest.approx(0.3)
-    assert backbone.encoder[0].blocks[0].drop_path == 0
-    assert backbone.embed.weight.shape == (27, 32, 64)
-
-
-def test_training_shuffles_the_curves_and_evaluation_does_not():
-    torch.manual_seed(0)
-    backbone = PointTransformer(32, preset("tiny"))
-    assert len({tuple(backbone.train()._curves()) for _ in range(20)}) > 3
-    assert all(backbone.eval()._curves() == [0, 1, 2, 3] for _ in range(3))
-
-
-def test_information_passes_between_distant_points_through_the_coarse_levels():
-    torch.manual_seed(0)
-    config = preset("tiny", patch=16)
-    means = torch.stack([torch.linspace(0, 1, 200), torch.zeros(200), torch.zeros(200)], dim=1)
-    structure = structure_of(means, config)
-    backbone = PointTransformer(4, config).eval()
-    x = torch.randn(200, 4, requires_grad=True)
-    backbone(x, structure)[0].sum().backward()
-    assert (x.grad.abs().sum(dim=1) > 0).sum() > 48  # three patches of the finest level

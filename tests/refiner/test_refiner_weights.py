@@ -1,5 +1,9 @@
+"""Weights, their config, and orders of voxels."""
+
+import itertools
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -9,7 +13,18 @@ from safetensors.torch import load_file, save_file
 
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner, save_refiner
+from pointsplat_ns.refiner import (
+    PRESETS,
+    Refiner,
+    RefinerConfigError,
+    WeightsError,
+    preset,
+    read_metadata,
+    read_refiner,
+    save_refiner,
+)
+from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.refiner.serialization import curve_codes
 from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
@@ -109,6 +124,7 @@ HUGE = [
     {"mlp_ratio": 1 << 16},
     {"patch": 1 << 40},
 ]
+
 WRONG = [0, -1, 1.5, math.nan, math.inf, True, None, "1", [], [1], [[1]], {}, {"a": 1}, [None], "x" * 10_000]
 
 
@@ -163,3 +179,96 @@ def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
     save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
     with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
         (read_refiner if key == "config" else read_metadata)(path)
+
+
+@pytest.mark.parametrize("size", PRESETS)
+def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
+    said = re.search(rf"``{size}``.*?([\d,]+) parameters", preset.__doc__, re.S).group(1)
+    assert sum(p.numel() for p in Refiner(preset(size)).parameters()) == int(said.replace(",", ""))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"enc_depths": (1, 1)}, "enc_depths has 2 entries; expected 3"),
+        ({"dec_heads": (5, 3)}, "dec: 32 channels do not divide into 5 heads"),
+        ({"strides": (2, 3)}, "strides holds 3; expected powers of two"),
+        ({"curves": ("z", "peano")}, "expected names out of z, z-trans"),
+        ({"curves": ()}, "expected names out of"),
+        ({"sh_degree": 4}, "sh_degree is 4"),
+        ({"grid": 1000}, "grid is 1000"),
+        ({"encoder": "single"}, "encoder is 'single'"),
+        ({"encoder": "concat", "use_appearance": False}, "encoder 'concat' expects both on"),
+        ({"encoder": "concat", "use_position": False}, "encoder 'concat' expects both on"),
+        ({"norm": "group"}, "norm is 'group'"),
+        ({"patch": 0}, "patch is 0"),
+        ({"drop_path": 1.0}, "drop_path is 1.0"),
+        ({"head_depth": 1}, "head_depth is 1"),
+    ],
+)
+def test_contradictory_settings_are_refused_by_name(changes, message):
+    with pytest.raises(RefinerConfigError, match=re.escape(message)):
+        preset("tiny", **changes)
+
+
+def full_grid(side: int) -> torch.Tensor:
+    return torch.tensor(list(itertools.product(range(side), repeat=3)))
+
+
+@pytest.mark.parametrize("curve", ["hilbert", "hilbert-trans"])
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_consecutive_cells_of_the_hilbert_curve_share_a_face(curve, bits):
+    cells = full_grid(2**bits)
+    walk = cells[curve_codes(cells, bits, [curve])[0].argsort()]
+    assert ((walk[1:] - walk[:-1]).abs().sum(dim=1) == 1).all()
+
+
+@pytest.mark.parametrize("bits", [16, 20])
+def test_z_order_equals_python_interleaving_at_full_width(bits):
+    generator = torch.Generator().manual_seed(0)
+    coords = torch.randint(0, 2**bits, (50, 3), generator=generator)
+    expected = [
+        sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
+    ]
+    assert curve_codes(coords, bits, ["z"])[0].tolist() == expected
+
+
+def test_unknown_curves_and_widths_are_refused():
+    with pytest.raises(ValueError, match="no curve 'peano'"):
+        curve_codes(full_grid(2), 1, ["peano"])
+    with pytest.raises(ValueError, match="21 bits"):
+        curve_codes(full_grid(2), 21, ["z"])
+
+
+def skilling(point: list[int], bits: int) -> int:
+    """Hilbert code of one point, bit by bit, as published."""
+    axes = list(point)
+    for bit in range(bits - 1, 0, -1):
+        low = (1 << bit) - 1
+        for i in range(3):
+            if axes[i] >> bit & 1:
+                axes[0] ^= low
+            else:
+                swapped = (axes[0] ^ axes[i]) & low
+                axes[0] ^= swapped
+                axes[i] ^= swapped
+    axes[1] ^= axes[0]
+    axes[2] ^= axes[1]
+    parity = 0
+    for bit in range(bits - 1, 0, -1):
+        if axes[2] >> bit & 1:
+            parity ^= (1 << bit) - 1
+    return sum(((axis ^ parity) >> b & 1) << (3 * b + 2 - i) for i, axis in enumerate(axes) for b in range(bits))
+
+
+@pytest.mark.parametrize("bits", [1, 2, 5, 16, 19, 20])
+def test_hilbert_tables_give_the_codes_of_the_published_algorithm(bits):
+    coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
+    assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(PointSplatError, match="no refiner size 'huge'; expected one of full, small, tiny"):
+        preset("huge")
+    with pytest.raises(RefinerConfigError, match="unknown refiner settings color_space"):
+        RefinerConfig.from_dict({"color_space": 1})

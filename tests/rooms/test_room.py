@@ -1,4 +1,4 @@
-"""The built-in rooms: repeatable, watertight, lit, with highlights that move, and readable as Replica scenes."""
+"""Rooms, and rays through them."""
 
 import errno
 import functools
@@ -15,7 +15,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from pointsplat_ns.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
-from pointsplat_ns.rooms.raycast import trace
+from pointsplat_ns.rooms.raycast import Solids, chart_points, occluded, surface, trace
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
 
@@ -63,15 +63,6 @@ def test_a_seed_gives_the_same_room_path_and_picture_and_another_seed_another(ro
     first, second = picture(room, poses[5]), picture(again, poses[5])
     assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
     assert make_room(7).size != room.size
-
-
-def test_rooms_differ_in_size_and_furniture():
-    rooms = [make_room(seed) for seed in range(12)]
-    assert len({room.size for room in rooms}) == 12
-    assert len({len(room.solids) for room in rooms}) > 6
-    assert all(50 < len(room.solids) < 140 for room in rooms)
-    assert {len(room.lights) for room in rooms} == {2, 3}
-    assert all(len(room.materials) == 6 * len(room.solids) for room in rooms)
 
 
 def test_depth_is_the_distance_to_the_walls_along_the_optical_axis(room):
@@ -203,12 +194,71 @@ def test_impossible_requests_are_refused_in_one_line(tmp_path):
         write_room(tmp_path / "r", 0, frames=1)
 
 
-@pytest.mark.parametrize("place", ["/proc/room", "/dev/null/room", "file/room", "x" * 256, "x" * 300 + "/room"])
-def test_a_place_where_no_folder_can_be_is_one_error_at_once(tmp_path, monkeypatch, place):
-    (tmp_path / "file").touch()
-    monkeypatch.setattr("pointsplat_ns.rooms.write.make_room", None)  # the room is not made first
-    with pytest.raises(DataError, match=f"{place}: cannot be written"):
-        write_room(tmp_path / place, 0, 2, 16, 12, progress=False)
+def room_with(*rows):
+    """A 6 x 6 x 3 room and the given (center, half, round)."""
+    center, half, round = zip(((0, 0, 1.5), (3, 3, 1.5), False), *rows, strict=True)
+    return Solids(
+        torch.tensor(center), torch.tensor(half), torch.tensor(round), torch.ones(len(half), dtype=torch.bool)
+    )
+
+
+def ray(origin, direction):
+    return torch.tensor(origin).float()[:, None], torch.tensor(direction).float()[:, None]
+
+
+@pytest.mark.parametrize(
+    ("solid", "origin", "direction", "expected"),
+    [
+        (((1.0, 0, 1), (0.5, 0.5, 0.5), False), (-2, 0, 1), (1, 0, 0), 2.5),
+        (((1.0, 0, 1), (0.5, 0.5, 0.5), False), (-2, 0, 1), (2, 0, 0), 1.25),
+        (((1.0, 0, 1), (0.5, 0.5, 0.5), True), (-2, 0.3, 1), (1, 0, 0), 3 - 0.4),
+        (((1.0, 0, 1), (0.5, 0.2, 0.8), True), (1, 0, 2.5), (0, 0, -1), 0.7),
+        (((1.0, 0, 1), (0.5, 0.5, 0.4), False), (-2, 0, 1.5), (1, 0, 0), 5.0),  # passes above, meets the wall
+        (((1.0, 0, 1), (0.5, 0.5, 0.4), True), (-2, 0.49, 1.3), (1, 0, 0), 5.0),  # within the ellipsoid's box only
+    ],
+)
+def test_first_hit_equals_the_analytic_distance(solid, origin, direction, expected):
+    t, index = trace(room_with(solid), *ray(origin, direction))
+    assert float(t) == pytest.approx(expected, abs=2e-6)  # float32 at distances of metres
+    assert int(index) == (0 if expected == 5.0 else 1)
+
+
+def test_intervals_in_float32_agree_with_float64_at_extremes():
+    generator = torch.Generator().manual_seed(5)
+    origin = torch.randn(3, 2000, generator=generator, dtype=torch.float64) * 3
+    direction = torch.randn(3, 2000, generator=generator, dtype=torch.float64)
+    direction[0, :200], direction[1, 200:400], direction[2, 400:600] = 0, 1e-8, 0  # along the faces
+    fast = room_with(((0.0, 0, 0), (1, 1, 1), False), ((0.0, 0, 0), (1, 1, 1), True))
+    slow = Solids(fast.center.double(), fast.half.double(), fast.round, fast.opaque)
+    for scale in (1e-3, 1.0, 1e3):  # rays of very different length
+        for number in (1, 2):
+            exact = slow.interval(number, origin, direction * scale)
+            found = fast.interval(number, origin.float(), (direction * scale).float())
+            clear = (exact[1] - exact[0]) * scale > 1e-2  # away from grazing hits
+            assert int(clear.sum()) > 50
+            for a, b in zip(exact, found, strict=True):
+                assert torch.allclose(a[clear] * scale, b[clear].double() * scale, atol=1e-3, rtol=1e-4)
+
+
+def test_what_stands_between_a_point_and_a_light_hides_it_unless_it_casts_no_shadow():
+    solids = room_with(((0.0, 0, 1), (0.3, 0.3, 0.3), True))
+    points, lamp = torch.tensor([[-1.0, -1], [0, 2], [1, 1]]), torch.tensor([1.0, 0, 1])
+    assert occluded(solids, points, lamp).tolist() == [True, False]
+    clear = Solids(solids.center, solids.half, solids.round, torch.zeros(2, dtype=torch.bool))
+    assert not occluded(clear, points, lamp).any()
+
+
+def test_surface_coordinates_and_normals_invert_chart_points():
+    solids = make_room(1).solids
+    u, v = torch.rand(2, 40, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
+    for chart in range(6 * len(solids)):
+        points, normals = chart_points(solids, chart, u, v)
+        hits = surface(solids, points, torch.full((40,), chart // 6))
+        assert (hits.chart == chart).all()
+        assert torch.allclose(hits.u, u, atol=1e-3) and torch.allclose(hits.v, v, atol=1e-3)  # thin solids are 1 cm
+        assert torch.allclose(hits.normal, normals, atol=1e-3)
+        outward = ((points - solids.center[chart // 6][:, None]) * normals).sum(0)
+        assert (outward < 0).all() if chart < 6 else (outward > 0).all()
 
 
 def test_rooms_that_are_there_are_left_alone_by_the_same_command(tmp_path, coarse_rooms, capsys):

@@ -10,12 +10,7 @@ import torch
 
 @contextmanager
 def broken(kind: str, places: Container[int]) -> Iterator[None]:
-    """Within, photos are NaN or infinite, or a gradient is NaN with a finite loss.
-
-    Args:
-        kind: nan, infinite or gradient.
-        places: in the sequence of scenes, which several processes share out; one process is there at that step.
-    """
+    """Within, photos are NaN or infinite, or a gradient is NaN with a finite loss."""
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
     from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 

@@ -120,13 +120,7 @@ class Capture:
         return folder
 
     def write_colmap(self, model: Path, names: list[str], to_colmap: np.ndarray | None = None) -> None:
-        """COLMAP's text files of the poses and seeds.
-
-        Args:
-            model: folder of the files.
-            names: of the photos.
-            to_colmap: (4, 4), takes the room's frame to COLMAP's.
-        """
+        """COLMAP's text files of the poses and seeds."""
         move = np.eye(4) if to_colmap is None else to_colmap
         model.mkdir(parents=True)
         numbers = " ".join(map(str, (*self.lens.focal, *self.lens.center, *self.lens.distortion)))

@@ -17,6 +17,7 @@ import pytest
 import tyro
 
 from pointsplat_ns.api import EXAMPLE
+from pointsplat_ns.cli import main
 from pointsplat_ns.cli.help import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
@@ -138,6 +139,8 @@ def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
             warnings.simplefilter("ignore", RuntimeWarning)  # the module may be imported already
             patch.setattr(sys, "argv", [words[2], *words[3:]])
             runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+        elif words[0] == "pointsplat":
+            main(list(words[1:]))  # without words it would end this process
         else:
             [script] = importlib.metadata.entry_points(group="console_scripts", name=words[0])
             patch.setattr(sys, "argv", list(words))

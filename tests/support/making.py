@@ -85,14 +85,7 @@ def record_kernels(monkeypatch, *modules) -> list:
 
 
 def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """A scene whose every parameter is drawn from the standard normal distribution.
-
-    Args:
-        n: how many Gaussians.
-        degree: of SH.
-        seed: the same seed gives the same scene.
-        dtype: of the parameters.
-    """
+    """A scene whose every parameter is drawn from the standard normal distribution."""
     generator = torch.Generator().manual_seed(seed)
     shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
     return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
@@ -115,16 +108,7 @@ def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
 def ball(
     n: int, degree: int = 1, seed: int = 0, log_size: float = math.log(0.25), opacity: float = 2.0, bright: float = 0.0
 ) -> Gaussians:
-    """The inside of a ball of radius 2, covered with coloured blobs.
-
-    Args:
-        n: how many.
-        degree: of SH.
-        seed: the same seed gives the same ball.
-        log_size: mean log of their standard deviations.
-        opacity: mean logit.
-        bright: added to the constant SH coefficients.
-    """
+    """The inside of a ball of radius 2, covered with coloured blobs."""
     generator = torch.Generator().manual_seed(seed)
     place = torch.randn(n, 3, generator=generator)
     place = 2 * place / place.norm(dim=1, keepdim=True)
@@ -143,13 +127,7 @@ EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
 
 
 def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Gaussians:
-    """A ball whose SH were moved along the basis in the directions that eyes see it from, by random steps.
-
-    Args:
-        n: how many.
-        degree: of SH.
-        eyes: (E, 3).
-    """
+    """A ball whose SH were moved along the basis in the directions that eyes see it from, by random steps."""
     from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
     scene = ball(n, degree)
@@ -163,14 +141,7 @@ def photographed(n: int = 600, degree: int = 3, eyes: torch.Tensor = EYES) -> Ga
 
 
 def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = False) -> Gaussians:
-    """A closed box of opaque Gaussians, 4 x 3 x 2 scene units: free inside, covered all around.
-
-    Args:
-        seed: the same seed gives the same room.
-        count: how many Gaussians.
-        size: their standard deviation.
-        smooth: colours change smoothly over the walls; otherwise each Gaussian has one of its own.
-    """
+    """A closed box of opaque Gaussians, 4 x 3 x 2 scene units: free inside, covered all around."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=generator) * 2 - 1
     rows, axis = torch.arange(count), torch.arange(count) % 3
@@ -195,16 +166,7 @@ def splats_in_view(
     opacity: float = 1.0,
 ) -> list[torch.Tensor]:
     """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N, 4), scales (N, 3),
-    opacities (N,) and SH of degree 3 (N, 16, 3).
-
-    Args:
-        n: how many Gaussians.
-        seed: the same seed gives the same ones.
-        dtype: of the tensors; all are drawn in float64.
-        scale: mean of the log-scales.
-        spread: standard deviation of the log-scales.
-        opacity: opacities are uniform from 0 to this.
-    """
+    opacities (N,) and SH of degree 3 (N, 16, 3)."""
     generator = torch.Generator().manual_seed(seed)
 
     def randn(*shape: int) -> torch.Tensor:
@@ -230,14 +192,7 @@ def camera_askew(
 
 
 def scene_to_refine(n: int = 200, sh_degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """Small blobs, uniform in a cube of side 4.
-
-    Args:
-        n: how many Gaussians.
-        sh_degree: of SH.
-        seed: the same seed gives the same scene.
-        dtype: of the parameters; all are drawn in float64.
-    """
+    """Small blobs, uniform in a cube of side 4."""
     generator = torch.Generator().manual_seed(seed)
 
     def randn(*shape: int) -> torch.Tensor:
@@ -252,19 +207,10 @@ def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that residuals are not zero."""
     from pointsplat_ns.refiner import Refiner, preset
 
-    smallest = {
-        "strides": (2,),
-        "enc_channels": (16, 16),
-        "enc_depths": (1, 1),
-        "enc_heads": (2, 2),
-        "dec_channels": (16,),
-        "dec_depths": (1,),
-        "dec_heads": (2,),
-        "patch": 32,
-        "head_width": 16,
-    }
+    encoder = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2)}
+    decoder = {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "patch": 32, "head_width": 16}
     torch.manual_seed(seed)
-    refiner = Refiner(preset("tiny", **{**smallest, **changes})).eval()
+    refiner = Refiner(preset("tiny", **{**encoder, **decoder, **changes})).eval()
     return move_zero_layers(refiner) if trained else refiner
 
 

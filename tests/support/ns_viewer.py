@@ -39,13 +39,7 @@ class Look:
 
 
 def look(viewer: Viewer, pose: np.ndarray, aspect: float = 4 / 3) -> Look:
-    """Open the viewer's page, connect as it does, and wait for the first picture.
-
-    Args:
-        viewer: in whose process this runs.
-        pose: camera-to-world (3 or 4, 4) in OpenGL axes, in the scene's frame.
-        aspect: width over height of the page.
-    """
+    """Open the viewer's page, connect as it does, and wait for the first picture."""
     place = f"127.0.0.1:{viewer.viser_server.get_port()}"
     with urllib.request.urlopen(f"http://{place}/", timeout=SECONDS) as response:
         page = response.read()

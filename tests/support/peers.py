@@ -28,14 +28,7 @@ scene in another format."""
 
 
 def peer(folder: Path, version: str, says: str | None = None, fails: str = "") -> str:
-    """The path of such a program, written into a folder; from version 3 on it has two modes.
-
-    Args:
-        folder: of the program.
-        version: of splat-transform.
-        says: what it prints of its version; by default what splat-transform prints.
-        fails: option of the mode that fails.
-    """
+    """The path of such a program, written into a folder; from version 3 on it has two modes."""
     says = f"splat-transform v{version} (0123abc)" if says is None else says
     modern = int(version.split(".")[0]) >= 3
     options = ("--decimate", "--decimate-adaptive") if modern else ("--decimate",)

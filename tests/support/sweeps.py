@@ -52,17 +52,7 @@ def quality(images: Sequence[Tensor], references: Sequence[Tensor]) -> ImageMetr
 def measured_room(
     folder: Path, scene: ps.Gaussians, budgets: Sequence[tuple[str, float]] = BUDGETS, views: ps.Views | None = None
 ) -> Tradeoff:
-    """Measure a scene at some budgets and write the pictures.
-
-    Args:
-        folder: the folder of the sweep.
-        scene: the dense scene.
-        budgets: method and share of each point.
-        views: to draw it from; two small ones into the example room by default.
-
-    Returns:
-        What was measured, with photos that differ a little from renders of the dense scene.
-    """
+    """Measure a scene at some budgets and write the pictures."""
     generator = torch.Generator().manual_seed(SEED)
     views = room_views() if views is None else views
     dense_renders = [ps.render(scene, view) for view in views]

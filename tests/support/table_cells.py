@@ -50,16 +50,7 @@ def write_scene(
     photos: bool = True,
     without: tuple[str, ...] = (),
 ) -> CellJournal:
-    """Write the cells of a scene at 30 and 10 %, in all ways but those without.
-
-    Args:
-        folder: of the tables.
-        name: of the scene.
-        group, dataset: of it.
-        worse: dB that all but the dense scene lose more than usual.
-        photos: whether there are photos.
-        without: names of ways that were not measured.
-    """
+    """Write the cells of a scene at 30 and 10 %, in all ways but those without."""
     journal = CellJournal(folder, name)
     for number, (way, share) in enumerate(WAYS.cells((0.3, 0.1))):
         dense = way == WAYS.dense

@@ -13,8 +13,6 @@ from pointsplat_ns.system.threads import (
     fixed_threads,
     in_threads,
     most_threads,
-    one_thread,
-    one_thread_each,
     shared_operations,
     suitable_threads,
 )
@@ -64,18 +62,6 @@ def test_all_threads_are_used_while_they_do_not_stall_else_one(machine):
     assert used() == 1 and torch.get_num_threads() == CORES
 
 
-def test_looks_are_rare(machine):
-    machine.stalls()
-    assert machine.looks == 3
-    for _ in range(1000):
-        machine.stalls()
-    assert machine.looks == 3, "no time has gone by"
-    start = machine.now
-    for _ in range(1000):
-        machine.stalls(after=0.01)
-    assert (machine.looks - 3) * 0.002 < 0.01 * (machine.now - start)
-
-
 def test_one_bad_look_is_enough_and_three_good_ones_are_needed(machine):
     machine.stalls()
     machine.stalled = True
@@ -101,18 +87,6 @@ def test_nothing_is_chosen_where_the_user_has(machine, count):
     assert torch.get_num_threads() == CORES and "OMP_NUM_THREADS" not in os.environ
 
 
-def test_nothing_is_chosen_for_a_gpu(machine):
-    machine.stalled = True
-    assert used(torch.device("cuda")) == CORES
-
-
-def test_a_step_within_a_step_is_left_alone(machine):
-    with suitable_threads():
-        machine.stalled = True
-        machine.now += 10
-        assert used() == CORES
-
-
 def test_pieces_that_do_not_wait_use_all_threads_in_a_step_on_one(machine):
     machine.stalled = True
     meet = threading.Barrier(CORES)  # passed only if so many are there at once
@@ -130,12 +104,3 @@ def test_a_real_look_works_in_every_mode_of_torch_and_changes_nothing():
     with suitable_threads():
         assert 1 <= torch.get_num_threads() <= before
     assert torch.get_num_threads() == before
-
-
-def test_contexts_of_one_thread_restore_the_callers(machine):
-    for context in (one_thread, one_thread_each):
-        with pytest.raises(ValueError), context():
-            assert torch.get_num_threads() == 1
-            assert most_threads() == (1 if context is one_thread else CORES)
-            raise ValueError
-        assert torch.get_num_threads() == CORES and most_threads() == CORES

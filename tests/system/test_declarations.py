@@ -13,7 +13,7 @@ from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
-from pointsplat_ns.system.kernels import Pointer, functions_of, structs_of
+from pointsplat_ns.system.kernels import functions_of, structs_of
 
 SHARED = """
 struct Hidden {
@@ -101,11 +101,6 @@ def test_tensors_are_passed_by_address_and_kept_alive():
 def test_a_value_that_does_not_fit_a_struct_is_an_error(values, error):
     with pytest.raises(error):
         structs_of(SHARED)["Task"](**values)
-
-
-def test_an_argument_of_another_dtype_is_an_error():
-    with pytest.raises(TypeError, match=r"tensor of torch\.float32 .* expected torch\.int64 on the CPU, contiguous"):
-        Pointer(torch.int64).from_param(torch.zeros(2))
 
 
 @pytest.mark.parametrize("wrong", ["int64_t count", "Unknown* task", "float** a"])

@@ -1,4 +1,4 @@
-"""Functions of a C++ file are called on threads of the process, and are compared with torch."""
+"""Kernels, memory and threads."""
 
 import os
 import subprocess
@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system import kernels
 from pointsplat_ns.system.kernels import agreement
+from pointsplat_ns.system.threads import cores, cpu_quota, fixed_threads
 
 
 @pytest.mark.parametrize("wrong", [2.0, float("nan"), float("inf")])
@@ -36,3 +38,108 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 7)
 """
     root = Path(kernels.__file__).parents[2]
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=root, timeout=120, check=True)
+
+
+PROGRAM = """
+import resource, sys
+import torch
+from pointsplat_ns.system.memory import keep_freed_memory
+kept = sys.argv[1] == "keep" and keep_freed_memory()
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(10_000_000) + 1  # two blocks of 40 MB, more than glibc ever keeps by itself
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+# The first rounds break up the memory that there is; later ones find their places.
+print(kept, min(faults() for _ in range(6)))
+"""
+
+
+def run(word: str) -> tuple[bool, int]:
+    out = subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
+    kept, faults = out.split()
+    return kept == "True", int(faults)
+
+
+def test_large_tensors_cost_new_pages_once():
+    kept, after = run("keep")
+    if not kept:
+        pytest.skip("not Linux with glibc, where there is nothing to do")
+    before = run("leave")[1]
+    # 80 MB are 19,500 pages of 4 kB; larger pages make fewer.
+    assert after < 0.1 * before
+
+
+THREADS = """
+import ctypes, sys, threading
+from pointsplat_ns.system.memory import share_freed_memory
+shared = sys.argv[1] == "keep" and share_freed_memory()
+libc, all_there = ctypes.CDLL("libc.so.6"), threading.Barrier(6)
+libc.malloc.restype = ctypes.c_void_p
+def work():
+    libc.malloc(60_000)
+    all_there.wait()
+threads = [threading.Thread(target=work) for _ in range(6)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+libc.malloc_stats()  # one line "Arena N:" on standard error for each place to allocate from
+print(shared)
+"""
+
+
+def test_threads_share_the_places_that_they_allocate_from():
+    def places(word: str) -> tuple[bool, int]:
+        done = subprocess.run([sys.executable, "-c", THREADS, word], capture_output=True, text=True, check=True)
+        return done.stdout.strip() == "True", done.stderr.count("Arena ")
+
+    shared, few = places("keep")
+    if not shared:
+        pytest.skip("not Linux with glibc, where there is nothing to do")
+    assert few <= 2 < places("leave")[1]
+
+
+@pytest.mark.parametrize("variable", [None, "7"])
+def test_a_fixed_number_of_threads_is_that_of_torch_and_of_programs_that_are_started(monkeypatch, variable):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", variable)
+    before = torch.get_num_threads()
+    with pytest.raises(KeyError), fixed_threads(before + 2):
+        assert torch.get_num_threads() == before + 2
+        assert os.environ["OMP_NUM_THREADS"] == str(before + 2)
+        raise KeyError
+    assert torch.get_num_threads() == before and os.environ.get("OMP_NUM_THREADS") == variable
+
+
+def machine(root: Path, cgroup: str, **files: str) -> Path:
+    """A folder with what Linux says of a process's control groups; ``files`` by their paths below sys/fs/cgroup."""
+    for name, text in {"proc/self/cgroup": cgroup, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, "utf-8")
+    return root
+
+
+def test_quotas_of_control_groups_are_read(tmp_path):
+    nested = {"cpu.max": "max 100000", "a/cpu.max": "150000 100000\n", "a/b/cpu.max": "400000 100000"}
+    assert cpu_quota(machine(tmp_path / "v2", "0::/a/b\n", **nested)) == 1.5
+    assert cpu_quota(machine(tmp_path / "none", "0::/a\n", **{"a/cpu.max": "max 100000\n"})) is None
+    inside = machine(tmp_path / "container", "0::/as/the/host/sees/it\n", **{"cpu.max": "300000 100000"})
+    assert cpu_quota(inside) == 3
+    old = {"cpu,cpuacct/a/cpu.cfs_quota_us": "250000", "cpu,cpuacct/a/cpu.cfs_period_us": "100000"}
+    assert cpu_quota(machine(tmp_path / "v1", "3:cpuset:/a\n2:cpu,cpuacct:/a\n", **old)) == 2.5
+    unlimited = {"cpu/a/cpu.cfs_quota_us": "-1", "cpu/a/cpu.cfs_period_us": "100000"}
+    assert cpu_quota(machine(tmp_path / "v1 free", "2:cpu:/a\n", **unlimited)) is None
+    assert cpu_quota(tmp_path / "another system") is None
+    assert cpu_quota(machine(tmp_path / "broken", "what is this\n0::/a\n", **{"a/cpu.max": "0 0"})) is None
+
+
+@pytest.mark.parametrize(("quota", "expected"), [(None, 4), (1.5, 1), (0.2, 1), (3.0, 3), (64.0, 4)])
+def test_cores_are_those_of_the_affinity_and_the_quota(monkeypatch, quota, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 2, 4, 6}, raising=False)
+    monkeypatch.setattr("pointsplat_ns.system.threads.cpu_quota", lambda: quota)
+    assert cores() == expected
+
+
+@pytest.mark.parametrize("count", [0, 1_000_000])
+def test_numbers_of_threads_that_nothing_has_are_refused(count):
+    with pytest.raises(PointSplatError, match=f"{count} threads; expected 1 to 1024"), fixed_threads(count):
+        pass

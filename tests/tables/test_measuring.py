@@ -1,7 +1,6 @@
 """Tables of a small room, really measured: every way, what cannot be measured, and going on."""
 
 import json
-import logging
 
 import pytest
 
@@ -10,7 +9,7 @@ from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.tables.cells import TABLE_FILES
-from pointsplat_ns.tables.ways import WAYS, Network
+from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.judging import Judge
 
 
@@ -18,10 +17,6 @@ def cells_of(group) -> dict:
     """Cells of the only scene of a group, by way and share."""
     [scene] = group.scenes
     return scene.cells
-
-
-def qualities(group) -> dict:
-    return {key: (cell.point.against_dense, cell.point.gaussians) for key, cell in cells_of(group).items()}
 
 
 @pytest.fixture()
@@ -97,15 +92,6 @@ def test_weights_that_know_the_scene_do_not_test_it(measured, weights, tmp_path)
     assert "were trained on this scene" in said["room/pointsplat/30%"]
 
 
-def test_of_several_weights_those_of_the_nearest_budget_are_taken(weights):
-    from pointsplat_ns.tables.making import Refiners
-
-    paths = [weights(f"keep{keep}", {"by": "paper", "keep": keep}) for keep in (0.1, 0.3, 500)]
-    refiners = Refiners(paths)
-    for share, path in ((0.1, paths[0]), (0.15, paths[0]), (0.2, paths[1]), (0.5, paths[1])):
-        assert refiners.find(Network(), share, "room")[0].path == path
-
-
 def test_a_program_that_fails_leaves_out_its_own_cell_alone(measured, peer, tmp_path, caplog):
     [group] = measured(splat_transform=peer(fails="--decimate"), only=["room/splat*/*"])
     assert [*cells_of(group)] == [("splat-transform-adaptive", 0.3)]
@@ -138,16 +124,6 @@ def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_pa
     assert json.loads(journal.read_text())["cells"][:3] == before  # also their times: they are not measured again
     monkeypatch.setattr(Judge, "judge", lambda *args: pytest.fail("nothing is left to be measured"))
     measured()
-
-
-def test_measuring_a_cell_again_gives_the_same_quality_to_the_bit(measured, caplog):
-    again = ["room/lightgaussian-tuned/30%", "room/dense/100%", "room/compact/30%"]
-    [first] = measured(only=again)
-    with caplog.at_level(logging.INFO, "pointsplat_ns"):
-        [second] = measured(only=again)
-    assert qualities(first) == qualities(second)
-    assert caplog.text.count("the same quality as before") == 3
-    assert cells_of(first)["compact", 0.3].point.seconds != cells_of(second)["compact", 0.3].point.seconds
 
 
 def test_more_steps_are_measured_and_other_cells_left_alone(measured, few_ways):

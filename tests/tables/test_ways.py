@@ -1,13 +1,15 @@
-"""Names of cells and rows, and the paper's figures."""
+"""Ways of a table."""
 
 import shlex
+import sys
 
 import pytest
 
-from pointsplat_ns.pruning import METHODS
-from pointsplat_ns.tables import ways
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Network, cell_key, published
-from pointsplat_ns.tradeoff.points import ImageMetrics
+import pointsplat_ns as ps
+from making import box_room
+from pointsplat_ns.system.programs import ProgramFailed
+from pointsplat_ns.tables.making import Reducer, SplatTransform
+from pointsplat_ns.tables.ways import PROTOCOL, WAYS, cell_key
 
 CELLS = WAYS.cells(PROTOCOL.shares)
 
@@ -18,47 +20,31 @@ def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
     assert "fox/merge/10%" in keys and "fox/dense/100%" in keys
 
 
-def test_every_row_has_a_cell():
-    cells = {(way.name, share) for way, share in CELLS}
-    assert {(way.name, share) for way in WAYS.table_1 for share in PROTOCOL.shares} <= cells
-    assert {(way.name, 0.1) for way in (*WAYS.table_4, *(way for _, way in WAYS.table_3))} <= cells
-
-
-def test_every_row_is_made_in_exactly_one_way():
-    for way in {way for way, _ in CELLS if way.name != "dense"}:
-        assert (way.by in METHODS) != (way.mode is not None), way
-        assert sum([way.fine_tuned, way.network is not None, way.repair != "none", way.mode is not None]) <= 1, way
-
-
-def test_networks_are_told_apart_by_all_that_tables_vary():
-    wanted = {way.network for way, _ in CELLS if way.network}
-    assert len(wanted) == 2 + 5 + 3  # SplatFormer's two, five lambdas, and the ablations of Table 4
-    text = str(Network(use_appearance=False, use_position=False))
-    assert text.startswith("dual encoder without appearance branch and position encoding, trained on scenes pruned by")
-
-
-def test_the_middle_lambda_is_the_row_of_table_1():
-    assert WAYS.selected(0.3) in WAYS.table_1 and WAYS.selected(0.5) not in WAYS.table_1
-
-
-def test_every_figure_of_the_paper_has_a_row():
-    cells = {(way.name, share) for way, share in CELLS}
-    assert {*ways._PUBLISHED[1]} <= cells and {*ways._PUBLISHED[3]} <= cells
-    assert [way.name for way in WAYS.table_4] == [name for name, _ in ways._PUBLISHED[4]]
-    assert len(ways._PUBLISHED[1]) == 1 + 8 * 3 and len(ways._PUBLISHED[3]) == 10
+def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
+    found = SplatTransform(peer())
+    assert (found.version, found.missing) == ("3.7.0", "")
+    ps.save(box_room(0, 60), tmp_path / "room.ply")
+    before = sorted(tmp_path.iterdir())
+    small = [mode.reduce(tmp_path / "room.ply", 20) for mode in found.modes]
+    assert [len(scene) for scene, _ in small] == [20, 20] and small[0][1].seconds > 0
+    assert not (small[0][0].means == small[1][0].means).all()
+    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize(
-    "table, dataset, way, share, expected",
+    "says, version, modes",
     [
-        (1, "ScanNet++", "dense", 1.0, ImageMetrics(29.73, 0.925, 0.165)),
-        (1, "Replica", "splatformer", 0.1, ImageMetrics(8.37, 0.388, 0.677)),
-        (1, "ScanNet++", "pup-tuned", 0.3, ImageMetrics(30.85, 0.931, 0.172)),
-        (3, "Replica", "pointsplat-0.9", 0.1, ImageMetrics(26.58, 0.882, 0.290)),
-        (4, "ScanNet++", "pointsplat-iii", 0.1, ImageMetrics(22.76, 0.847, 0.385)),
-        (4, "Replica", "pointsplat-iii", 0.1, None),
-        (1, "Replica", "merge", 0.1, None),
+        ("splat-transform v2.7.1", "2.7.1", 1),
+        ("v10.0.0-beta.1", "10.0.0-beta.1", 2),
+        ("warning: old\nv3.0.0", "3.0.0", 2),
     ],
 )
-def test_figures_are_the_papers(table, dataset, way, share, expected):
-    assert published(table, dataset, way, share) == expected
+def test_versions_are_told_apart(peer, says, version, modes):
+    found = SplatTransform(peer(says))
+    assert found.version == version and len(found.modes) == modes
+
+
+def test_a_program_that_writes_nothing_is_an_error(tmp_path):
+    reducer = Reducer("idle", lambda source, count, target: [sys.executable, "-I", "-S", "-c", "pass"])
+    with pytest.raises(ProgramFailed, match="wrote no file"):
+        reducer.reduce(tmp_path / "room.ply", 10)

@@ -1,21 +1,24 @@
-"""The cheapest scene for targets, as ``compact`` finds it: in any format, as it is read from the file."""
+"""Finding a setting, and judging it."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns import folders
 from pointsplat_ns.compression import repair
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.tradeoff import judging, settings
 from pointsplat_ns.tradeoff.finding import find_scene
+from pointsplat_ns.tradeoff.judging import Judge, JudgedViews
 from pointsplat_ns.tradeoff.measuring import Measurer
 from pointsplat_ns.tradeoff.targets import Targets
 
@@ -70,8 +73,9 @@ def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, plain_pl
     assert found.target.split(":")[0] == sweep.why.split(":")[0]
 
 
-@pytest.mark.parametrize("resolution", [None, "96x54"])
-@pytest.mark.parametrize("search", ["compact", "compact_folder", "measure_tradeoff"])
+@pytest.mark.parametrize(
+    ("search", "resolution"), [("compact", None), ("compact_folder", "96x54"), ("measure_tradeoff", "96x54")]
+)
 def test_scenes_are_judged_in_the_views_that_compact_compares_in(
     room, tmp_path, plain_page, plain_plots, monkeypatch, resolution, search
 ):
@@ -181,3 +185,39 @@ def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, d
     ps.save(dense, tmp_path / "rooms" / "a.ply")
     [result] = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=30.0, target_mb=0.002)
     assert result.status == "failed" and "the best within the limits has" in result.error
+
+
+@pytest.fixture()
+def photos(dense, room_views):
+    return [(image + 0.1).clamp(0, 1) for image in render(dense, room_views)]
+
+
+def judged(judge: Judge, scene, key="some", **options):
+    return judge.judge(scene, key, lambda share: None, **options)
+
+
+@pytest.fixture()
+def judge(dense, room_views, no_lpips):
+    """A judge of the room without photos."""
+    return Judge(dense, JudgedViews(room_views, None, ""))
+
+
+def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room_views):
+    photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))] * 3
+    small = JudgedViews(room_views, photos, "").resized(24)
+    assert (small.views.width, small.views.height) == (24, 18)
+    wanted = photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3))
+    assert torch.allclose(small.photos[0], wanted, atol=1e-6)
+    assert JudgedViews(room_views, photos, "").resized(48).photos is photos
+
+
+def test_lpips_is_given_where_weights_are_at_hand(dense, room_views, tmp_path, some_lpips):
+    judge = Judge(dense, JudgedViews(room_views, None, ""), tmp_path)
+    quality = judged(judge, ps.prune(dense, 100)).against_dense
+    assert (quality.lpips is not None and 0 < quality.lpips < 2) == some_lpips
+    assert ("LPIPS is missing" in judge.no_lpips) != some_lpips
+
+
+def test_pictures_too_small_for_ssim_are_refused(dense, room_views, tmp_path):
+    with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
+        Judge(dense, JudgedViews(replace(room_views, width=10), None, ""), tmp_path)

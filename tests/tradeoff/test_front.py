@@ -1,10 +1,11 @@
-"""Which points are on the front, what each loses, and which one is recommended."""
+"""Fronts and their plots."""
 
 import math
 from dataclasses import replace
 
 import pytest
 import torch
+from matplotlib.image import imread
 
 import pointsplat_ns as ps
 from pointsplat_ns.tradeoff.front import (
@@ -12,13 +13,13 @@ from pointsplat_ns.tradeoff.front import (
     expected_loss,
     fastest_above,
     fastest_within,
-    loss_of,
     pareto_front,
     psnr_within,
     recommend,
 )
-from pointsplat_ns.tradeoff.points import ImageMetrics, Point
-from pointsplat_ns.tradeoff.settings import DENSE, Setting
+from pointsplat_ns.tradeoff.outputs import SWEEP_FILES, plot
+from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Tradeoff
+from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting
 from trades import point
 
 ALL = Setting(100_000, 3, by=DENSE)
@@ -61,12 +62,6 @@ def test_front_takes_the_better_of_two_that_cost_the_same_and_the_first_of_two_e
     assert front[0] == "better" and "tenth" not in front
 
 
-def test_front_leaves_out_points_without_the_metric():
-    assert pareto_front(POINTS, "bytes", "renders", "lpips") == []
-    unknown = replace(POINTS[4], against_dense=ImageMetrics(math.nan, 0.9))
-    assert keys(pareto_front([*POINTS[:4], unknown], "bytes", "renders", "psnr")) == ["third", "half", "dense"]
-
-
 @pytest.mark.parametrize(
     ("find", "db", "key"),
     [
@@ -79,21 +74,12 @@ def test_the_fastest_that_is_good_enough(find, db, key):
     assert find(POINTS, db).key == key
 
 
-def test_nothing_is_recommended_by_photos_that_are_not_there():
-    assert fastest_within([replace(p, against_photos=None) for p in POINTS], 0.5) is None
-
-
 def test_of_two_as_fast_the_smaller_is_recommended_and_where_times_mean_nothing_the_fewest_gaussians():
     twin = replace(POINTS[3], key="twin", bytes=20)
     assert fastest_above([*POINTS, twin], 35).key == "twin"
     slow = replace(POINTS[1], key="few", frame_ms=1e6, gaussians=1)
     assert fastest_within([*POINTS, slow], 100, trusted=False).key == "few"
     assert fastest_within([*POINTS, slow], 100).key != "few"
-
-
-@pytest.mark.parametrize("loss", [0.05, 0.5, 3.0, 10.0])
-def test_the_loss_at_the_psnr_for_a_loss_is_that_loss(loss):
-    assert expected_loss(psnr_within(loss)) == pytest.approx(loss)
 
 
 def test_the_expected_loss_is_that_of_independent_errors():
@@ -104,12 +90,6 @@ def test_the_expected_loss_is_that_of_independent_errors():
     small = dense + 10 ** (-33.0 / 20) * of_merging
     lost = float(ps.psnr(dense, photo) - ps.psnr(small, photo))
     assert lost == pytest.approx(expected_loss(float(ps.psnr(small, dense))), abs=0.02)
-
-
-def test_photos_are_believed_where_they_are():
-    dense, small = point(ALL, math.inf, photos=30.0), point(Setting(1000, 3), 50.0, photos=28.5)
-    assert loss_of(small, dense) == 1.5
-    assert loss_of(point(Setting(1000, 3), 50.0), point(ALL, math.inf)) == expected_loss(50.0)
 
 
 def test_the_fastest_within_the_loss_is_recommended_not_the_smallest():
@@ -131,3 +111,19 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     assert f"the next best, {other.label}, loses {loss} 10,000 Gaussians, 2.48 MB in place of 24.8 MB, " in why
     assert "50 ms a frame in place of 100, made in 3 s" in why
     assert recommend([dense], 0.5)[1].endswith("is the dense scene itself")
+
+
+def sweep(photos: float | None, repairs=REPAIRS) -> Tradeoff:
+    points = [point(Setting(100_000, 3, by=DENSE), math.inf, 100.0, photos)]
+    for number, repair in enumerate(repairs):
+        lower = None if photos is None else photos - 1 - number
+        points.append(point(Setting(10_000 - 100 * number, 3 - number % 2, repair), 30.0 - number, 10 + number, lower))
+    return Tradeoff("room", "a machine", "given views", 64, 48, tuple(points), recommended=points[-1].key)
+
+
+@pytest.mark.parametrize("against", SWEEP_FILES.plots)
+@pytest.mark.parametrize("photos, wide", [(28.0, True), (None, False)])
+def test_there_is_a_panel_for_renders_and_one_for_photos_where_there_are_any(against, photos, wide, tmp_path):
+    plot(sweep(photos), against, tmp_path / "plot.png")
+    height, width = imread(tmp_path / "plot.png").shape[:2]
+    assert (width > 2 * height) == wide

@@ -1,19 +1,31 @@
-"""points.json: what is put in comes out, and what is not ours is refused."""
+"""The journal of a sweep, its machine and settings."""
 
-import dataclasses
 import json
 import math
+import shlex
+import threading
+from pathlib import Path
 
 import pytest
+import torch
 
-from pointsplat_ns.errors import SceneError
+import pointsplat_ns as ps
+from making import same_bits
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression import repair
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.discovery import FOLDER_FILES
-from pointsplat_ns.tradeoff import journal as journal_module
+from pointsplat_ns.looking import view_source
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.tradeoff import machine
 from pointsplat_ns.tradeoff.journal import Journal
-from pointsplat_ns.tradeoff.settings import DENSE, Setting
+from pointsplat_ns.tradeoff.machine import is_busy, one_at_a_time
+from pointsplat_ns.tradeoff.measuring import make
+from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Naming, Setting, check_repairs
 from trades import point
 
 OF = {"scene": "abc", "views": 10}
+
 POINT = point(Setting(10_000, 3, "quick"), 31.25, photos=27.5)
 
 
@@ -30,13 +42,6 @@ def test_points_are_read_back_as_they_were(written):
     again = Journal(written, OF)
     assert again.points == {Setting(10_000, 3, "quick"): POINT}
     assert again.dense == point(Setting(100_000, 3, by=DENSE), math.inf)
-
-
-def test_the_file_is_json_that_any_reader_takes(written):
-    content = json.loads(
-        (written / FOLDER_FILES.sweep_points).read_text(), parse_constant=lambda name: pytest.fail(name)
-    )
-    assert [values["key"] for values in content["points"]] == ["dense", "10pct_sh3_quick"]
 
 
 def test_a_point_is_on_disk_as_soon_as_it_is_added(written):
@@ -56,14 +61,6 @@ def test_a_point_that_cannot_be_written_leaves_those_that_were(written, monkeypa
         Journal(written, OF).add(point(Setting(5000, 3), 28.0))
     assert (written / FOLDER_FILES.sweep_points).read_bytes() == before
     assert [path.name for path in written.iterdir()] == [FOLDER_FILES.sweep_points]
-
-
-@pytest.mark.parametrize("name, value", [("scene", "abd"), ("views", 11), ("machine", "another")])
-def test_points_of_another_sweep_are_refused(written, name, value):
-    with pytest.raises(
-        SceneError, match=rf"{FOLDER_FILES.sweep_points}: its points are of another sweep \({name}: .*--force"
-    ):
-        Journal(written, {**OF, name: value})
 
 
 @pytest.mark.parametrize(
@@ -101,13 +98,6 @@ def test_a_file_that_holds_something_else_is_refused(tmp_path, text):
         Journal(tmp_path, OF)
 
 
-def test_a_file_too_large_is_refused_before_it_is_read(written, monkeypatch):
-    form = dataclasses.replace(journal_module.POINTS_FORM, most_bytes=100)
-    monkeypatch.setattr(journal_module, "POINTS_FORM", form)
-    with pytest.raises(SceneError, match="larger than 100 bytes"):
-        Journal(written, OF)
-
-
 @pytest.mark.parametrize("version", [1, 2, "two", None, "x" * 1000])
 def test_points_of_another_version_are_refused_in_one_line(written, version):
     """Those of version 1 were timed otherwise, and had other fields."""
@@ -121,3 +111,71 @@ def test_points_of_another_version_are_refused_in_one_line(written, version):
     ) as e:
         Journal(written, OF)
     assert len(str(e.value).splitlines()) == 1 and len(str(e.value)) < 400
+
+
+def test_a_second_measurement_waits_for_the_first_and_says_so():
+    said, entered = [], threading.Event()
+
+    def second() -> None:
+        with one_at_a_time(lambda what, share: said.append(what)) as alone:
+            assert alone
+            entered.set()
+
+    with one_at_a_time(lambda what, share: None):
+        other = threading.Thread(target=second)
+        other.start()
+        assert not entered.wait(0.3)
+        assert said == ["waiting for another measurement on this machine"]
+    assert entered.wait(10)
+    other.join()
+
+
+def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):
+    monkeypatch.setattr(machine, "cores", lambda: 4)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert [is_busy(others) for others in (0.0, 2.0, 2.3, 4.0)] == [False, False, True, True]
+
+
+SETTINGS = [
+    Setting(40, 1),
+    Setting(41, 0),
+    Setting(40, 1, "refiner"),
+    Setting(40, 0, "quick", "paper"),
+    Setting(40, 1, by="coverage"),
+]
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: f"{setting.count} {setting.repair} {setting.by}")
+def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, tmp_path, monkeypatch):
+    """With a scene whose path has a space, and few and small views."""
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setattr(view_source.Sampler, "views", lambda *args, **options: room_views)
+    monkeypatch.chdir(tmp_path)
+    path = Path("the room.ply")
+    dense = ps.load(room)
+    path.write_bytes(room.read_bytes())
+    naming = Naming(path, "room", len(dense), dense.sh_degree)
+    made = make(dense, setting, lambda: ViewSource(dense), lambda what, share: None)
+    assert (len(made.scene), made.scene.sh_degree) == (setting.count, setting.sh_degree)
+    program, *words = shlex.split(naming.command(setting))
+    assert program == "pointsplat"
+    main(words)
+    assert same_bits(ps.load(f"room_{naming.key(setting)}.ply"), made.scene)
+    assert Path(f"room_{naming.key(setting)}.ply").stat().st_size == setting.bytes
+
+
+def test_keys_differ_and_fit_into_names_of_files():
+    naming = Naming(Path("room.ply"), "room", 100_000, 3)
+    repairs = [Setting(10_000, 3, repair) for repair in REPAIRS]
+    settings = [*repairs, Setting(10_000, 2), Setting(10_020, 3), Setting(10_000, 3, by="log-volume")]
+    keys = [naming.key(setting) for setting in settings]
+    assert len(set(keys)) == len(keys)
+    assert all(character.isalnum() or character in "._-" for key in keys for character in key)
+
+
+def test_repairs_are_put_in_order_and_unknown_ones_refused():
+    assert check_repairs(("quick", "none", "quick")) == ("none", "quick")
+    with pytest.raises(PointSplatError, match="repairs are magic; expected some of none, refiner, quick, thorough"):
+        check_repairs(("magic",))
+    with pytest.raises(PointSplatError, match="repairs are empty"):
+        check_repairs(())

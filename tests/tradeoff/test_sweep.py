@@ -5,15 +5,13 @@ import json
 import math
 
 import pytest
-import torch
 
 import pointsplat_ns as ps
-from making import same_bits
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff import judging, measuring, sweep
+from pointsplat_ns.tradeoff import measuring, sweep
 from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import picture_path
@@ -41,46 +39,6 @@ def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, pl
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
     assert (tmp_path / SWEEP_FILES.page).read_text().split() == [point.key for point in result.points]
-
-
-def test_the_first_useful_results_are_there_after_the_first_smaller_scene(new_sweep, tmp_path, plain_page):
-    running = new_sweep(tmp_path)
-    running.measure_dense()
-    assert plain_page == []
-    running.measure(Setting(40, 1))
-    assert plain_page == [tmp_path] and (tmp_path / SWEEP_FILES.plots["gaussians"]).is_file()
-
-
-def test_points_have_exact_counts_sizes_and_commands(new_sweep, tmp_path, room):
-    running = new_sweep(tmp_path)
-    running.measure_dense()
-    setting = Setting(40, 0)
-    measured = running.measure(setting)
-    assert (measured.gaussians, measured.sh_degree, measured.share) == (40, 0, 0.1)
-    ps.save(running.scene(setting), tmp_path / "made.ply")
-    assert (tmp_path / "made.ply").stat().st_size == measured.bytes
-    assert measured.command == f"pointsplat prune {room} --keep 40 --sh 0 -o room_10pct_sh0.ply"
-    assert measured.frame_ms_low <= measured.frame_ms <= measured.frame_ms_high
-    assert measured.seconds > 0 and (measured.peak_bytes is None or measured.peak_bytes > 10**7)
-
-
-def test_measuring_a_point_again_gives_the_same_quality_to_the_bit(new_sweep, tmp_path):
-    setting = Setting(40, 1, "quick")
-    first, second = (new_sweep(tmp_path / name) for name in "ab")
-    for running in (first, second):
-        running.measure_dense()
-    a, b = first.measure(setting), second.measure(setting)
-    assert a.against_dense == b.against_dense
-    assert same_bits(first.scene(setting), second.scene(setting))
-
-
-def test_a_scene_that_is_needed_again_is_made_again_the_same(new_sweep, tmp_path):
-    running = new_sweep(tmp_path)
-    running.measure_dense()
-    running.measure(Setting(40, 1))
-    kept = running.scene(Setting(40, 1))
-    running.measure(Setting(30, 1))
-    assert same_bits(running.scene(Setting(40, 1)), kept)
 
 
 @pytest.mark.parametrize("after", [1, 2])
@@ -146,22 +104,6 @@ def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, t
     result = new_sweep(tmp_path, gone, points=2).run()
     assert result.points[1].against_photos is None and result.views_origin == "given views"
     assert "there are no held-out photos: photo_3.jpg: no such file" in result.notes
-
-
-@pytest.mark.parametrize("others, said", [(50.0, True), (0.0, False)])
-def test_a_busy_machine_is_said_to_be_one(new_sweep, tmp_path, monkeypatch, others, said):
-    monkeypatch.setattr(judging.Judge, "psnr", lambda self, scene: 0.0)
-    monkeypatch.setattr("pointsplat_ns.tradeoff.machine.OtherPrograms.cores", lambda self: others)
-    monkeypatch.setattr("pointsplat_ns.tradeoff.machine.cores", lambda: torch.get_num_threads())
-    result = new_sweep(tmp_path, points=2, repairs=("none",)).run()
-    assert any("times are not to be trusted" in note for note in result.notes) == said
-
-
-def test_progress_never_goes_back_and_ends(new_sweep, tmp_path):
-    shares = []
-    keep = lambda what, share: shares.append(share) if what == "measuring" else None  # noqa: E731
-    new_sweep(tmp_path, progress=keep, points=3).run()
-    assert shares == sorted(shares) and shares[-1] == 1.0
 
 
 def test_points_of_another_scene_are_refused_before_anything_is_measured(new_sweep, tmp_path, room, room_views):

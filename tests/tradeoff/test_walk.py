@@ -1,4 +1,4 @@
-"""The walk: what it tries, what it leaves, where it ends, on trades that are known in advance."""
+"""The walk over settings, and targets."""
 
 import itertools
 import math
@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import pytest
 
+from pointsplat_ns.compression.budget_search import BUDGETS
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.tradeoff.front import loss_of, psnr_within
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import Setting
+from pointsplat_ns.tradeoff.targets import Targets, TargetSearch
 from pointsplat_ns.tradeoff.walk import WALK, Enough, Plan, measure_walk
 from trades import Trade
 
@@ -56,15 +59,6 @@ def test_a_degree_that_is_worse_than_fewer_gaussians_of_the_same_size_is_left_af
     assert [setting.count for setting in walked(trade) if setting.sh_degree == 0] == [10_000]
 
 
-def test_a_scene_without_sh_bands_has_one_way():
-    assert {s.sh_degree for s in walked(Trade(sh_degree=0), Plan(100_000, 0))} == {0}
-
-
-def test_it_ends_where_the_front_is_flat():
-    flat = Trade(slope=0.01, at_all=60.0, gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
-    assert len(walked(flat)) == 4  # a tenth, the repair there, and the two other budgets
-
-
 def test_when_it_ends_no_gap_is_both_steep_and_wide():
     trade = Trade(gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
     measured = walked(trade)
@@ -106,3 +100,69 @@ def test_photos_go_before_renders():
     measure_walk(Plan(trade.count, 3, repairs=("none",)), measure, dense, trade.cut)
     assert max(setting.count for setting in measured) == 30_000
     assert len(measured) > 6
+
+
+def search(trade: Trade, targets: Targets, repairs=("none", "quick")) -> TargetSearch:
+    return TargetSearch(
+        targets, Plan(trade.count, trade.sh_degree, repairs=repairs), trade.measure, trade.cut, "3 views"
+    )
+
+
+@pytest.mark.parametrize("db", [20.0, 27.0, 30.5, 36.0, 41.0])
+@pytest.mark.parametrize("gain", [3.0, 0.0])
+def test_the_smallest_file_of_a_quality_is_found_in_few_tries(db, gain):
+    trade = Trade(gains={"quick": gain})
+    found = search(trade, Targets(db=db)).run()
+    tries = len(trade.asked)
+    assert found.point.against_dense.psnr >= db
+    assert trade.smallest(db) <= found.point.bytes <= BUDGETS.repaired.precision * trade.smallest(db)
+    assert tries <= 20
+
+
+def test_it_decides_count_degree_and_repair_from_the_scene():
+    views_matter = Trade(gains={"quick": 2.0}, cuts={0: 15.0, 1: 16.0, 2: 17.0})
+    assert search(views_matter, Targets(db=30.0)).run().setting.sh_degree == 3
+    plain = Trade(gains={"quick": -1.0}, cuts={0: 60.0, 1: 61.0, 2: 62.0})
+    chosen = search(plain, Targets(db=30.0)).run().setting
+    assert (chosen.sh_degree, chosen.repair) == (0, "none")
+
+
+def test_what_the_next_cheaper_would_have_missed_is_said():
+    found = search(Trade(), Targets(db=30.0)).run()
+    assert "dB against the dense scene's renders in 3 views, " in found.why
+    assert "dB where 30 are wanted" in found.why and "the next cheaper" in found.why
+
+
+def test_all_targets_hold_at_once():
+    targets = Targets(db=30.0, ms=20.0, mb=3.0)
+    point = search(Trade(), targets).run().point
+    assert targets.missed(point) == []
+
+
+def test_a_slower_scene_of_a_smaller_file_does_not_hide_one_that_is_fast_enough():
+    """Without SH bands files are smaller, but it takes more Gaussians to reach the quality."""
+    trade = Trade(gains={}, cuts={0: 31.0, 1: 32.0, 2: 33.0})
+    smallest = search(trade, Targets(db=30.0)).run().point
+    assert smallest.sh_degree < 3
+    limit = smallest.frame_ms - 1
+    fast = search(trade, Targets(db=30.0, ms=limit)).run().point
+    assert fast.frame_ms <= limit and fast.bytes > smallest.bytes
+
+
+@pytest.mark.parametrize(
+    "targets, said",
+    [(Targets(db=40.0, mb=0.5), "over --target-mb 0.5"), (Targets(db=40.0, ms=3.0), "over --target-ms 3")],
+)
+def test_targets_that_exclude_one_another_name_the_obstacle_and_the_best_reachable(targets, said):
+    trade = Trade()
+    with pytest.raises(BudgetError, match="no scene meets all targets: what reaches 40 dB") as refused:
+        search(trade, targets).run()
+    assert said in str(refused.value)
+    best = search(Trade(), Targets(ms=targets.ms, mb=targets.mb)).run().point
+    assert f"the best within the limits has {best.against_dense.psnr:.2f} dB" in str(refused.value)
+
+
+@pytest.mark.parametrize("targets", [{}, {"db": 0.0}, {"ms": -1.0}, {"mb": float("nan")}, {"db": float("inf")}])
+def test_targets_that_mean_nothing_are_refused(targets):
+    with pytest.raises(BudgetError, match="--target-"):
+        Targets(**targets)

@@ -118,15 +118,6 @@ def test_picture_fills_the_stage_with_as_many_pixels_as_the_window_has(page):
         assert "sharpening" not in text_of(page)
 
 
-def test_picture_is_not_done_while_the_camera_moves_and_the_full_one_follows(page):
-    before = picture(page)
-    for _ in range(10):
-        page.execute_script("flight.camera.turn(0.05, 0); flight.change()")
-        assert not still(page)
-    after = picture(page)
-    assert after.shape == before.shape and np.abs(after - before).mean() > 5
-
-
 def test_wipe_moves_from_one_scene_to_the_other(page):
     page.execute_script("flight.reset()")
     brightness = []
@@ -147,14 +138,6 @@ def test_budget_changes_the_count_at_once_and_is_merged(page):
     assert re.search(r"pointsplat prune .* --keep 20%", text_of(page))
     assert "\n3,143 Gaussians" in text_of(page), "the other scene is as it was"
     keep(page, 0, 100)
-
-
-def test_page_fits_a_phone_and_follows_the_colours_of_the_reader(page):
-    assert phone_and_colours(page) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
-
-
-def test_page_complains_of_nothing(page):
-    assert complaints(page) == []
 
 
 def test_ctrl_c_ends_it_without_a_traceback_and_the_page_says_so(page, program):

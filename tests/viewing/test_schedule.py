@@ -1,11 +1,21 @@
-"""What is drawn for a moving camera, by the schedule alone: the clock is turned by hand, and nothing is drawn."""
+"""What is drawn when, and the painter."""
 
+import math
+import queue
 import threading
+from collections.abc import Iterator
 
+import numpy as np
 import pytest
+import torch
 
+import pointsplat_ns as ps
+from making import ball
 from pointsplat_ns.viewing import schedule as module
+from pointsplat_ns.viewing.film import to_uint8
+from pointsplat_ns.viewing.painter import Painter, PictureRequest, ViewerCamera, paint
 from pointsplat_ns.viewing.schedule import SCHEDULE, DrawingStep, Schedule, ScheduleSettings
+from pointsplat_ns.viewing.selection import ReducedScene
 
 
 class Clock:
@@ -46,10 +56,6 @@ def rest(schedule: Schedule[str], clock: Clock, seconds: float = SCHEDULE.moving
     return steps
 
 
-def test_nothing_is_drawn_before_anything_is_asked_for(schedule):
-    assert schedule.next(timeout=0) is None
-
-
 def test_moving_camera_gets_small_pictures_and_a_still_one_the_whole(schedule, clock):
     for number in range(4):
         schedule.submit(f"camera {number}")
@@ -59,16 +65,6 @@ def test_moving_camera_gets_small_pictures_and_a_still_one_the_whole(schedule, c
     sides = [step.side for step in rest(schedule, clock)]
     assert sides[-1] == 960 and sides == sorted(set(sides))
     assert schedule.next(timeout=0) is None, "nothing changes any more"
-
-
-def test_requests_that_came_while_drawing_are_skipped_but_for_the_newest(schedule, clock):
-    schedule.submit("first")
-    step = schedule.next(timeout=0)
-    for request in ("second", "third"):
-        schedule.submit(request)
-    assert not schedule.outdated(step), "else nothing would be seen while the camera moves"
-    schedule.done(step, 0.1)
-    assert schedule.next(timeout=0).request == "third"
 
 
 def test_newer_camera_cancels_the_whole_picture(schedule, clock):
@@ -92,51 +88,6 @@ def test_whole_picture_has_all_gaussians_and_comes_soon_where_it_is_cheap(schedu
     assert step.whole and rest(schedule, clock) == [], "the small picture is the whole one already"
 
 
-@pytest.mark.parametrize("whole", [0.3, 3.0, 30.0])
-@pytest.mark.parametrize("fixed", [0.0, 0.7])
-def test_time_of_moving_pictures_settles(schedule, clock, whole, fixed):
-    """A picture takes some time for its pixels and some for its Gaussians, however small it is."""
-
-    def seconds(step: DrawingStep[str]) -> float:
-        return whole * (fixed * step.share + (1 - fixed) * (step.side / 960) ** 2 * step.share)
-
-    taken = []
-    for number in range(60):
-        schedule.submit(str(number))
-        step = schedule.next(timeout=0)
-        taken.append(seconds(step))
-        schedule.done(step, taken[-1])
-    least = whole * (fixed + (1 - fixed) * (SCHEDULE.moving_side / 960) ** 2) * SCHEDULE.least_share
-    aim = max(SCHEDULE.moving_seconds, least)
-    assert all(0.6 * aim < some < 1.6 * aim for some in taken[-10:]), taken[-10:]
-    assert SCHEDULE.moving_side <= step.side <= 960 and SCHEDULE.least_share <= step.share <= 1
-
-
-def test_gaussians_are_left_out_only_of_the_smallest_pictures(schedule, clock):
-    seen = set()
-    for number in range(40):
-        schedule.submit(str(number))
-        step = drawn(schedule, clock, 5.0)
-        seen.add((step.side > SCHEDULE.moving_side, step.share < 1))
-    assert seen == {(True, False), (False, False), (False, True)} or seen == {(True, False), (False, True)}
-    assert step.share == pytest.approx(SCHEDULE.least_share)
-    steps = rest(schedule, clock)
-    assert all(step.share == 1 and not step.moving for step in steps)
-    assert [step.side for step in steps] == [960]
-
-
-def test_close_wakes_who_waits_and_outdates_what_is_drawn(schedule):
-    schedule.submit("any")
-    step = schedule.next(timeout=0)
-    schedule.done(step, 0.1)
-    found = []
-    waiting = threading.Thread(target=lambda: found.append(schedule.next()))
-    waiting.start()
-    schedule.close()
-    waiting.join(10)
-    assert found == [None] and schedule.outdated(step) and schedule.next(timeout=0) is None
-
-
 def test_who_waits_is_woken_by_a_request_and_by_rest(monkeypatch):
     monkeypatch.setattr(module, "SCHEDULE", ScheduleSettings(rest_seconds=0.05))
     schedule: Schedule[str] = Schedule(960)
@@ -154,3 +105,89 @@ def test_who_waits_is_woken_by_a_request_and_by_rest(monkeypatch):
     schedule.submit("now")
     drawing.join(10)
     assert not drawing.is_alive() and found[0].moving and found[-1].side == 960
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    return ball(500)
+
+
+@pytest.fixture(scope="module")
+def camera(scene) -> ViewerCamera:
+    view = ps.sample_views(scene, 1)[0]
+    fov = 2 * math.atan(0.5 * view.height / float(view.K[1, 1]))
+    return ViewerCamera(view.viewmat, fov, 4 / 3, view.background, view.near_plane)
+
+
+def request(
+    camera: ViewerCamera, scene: ps.Gaussians, second: ps.Gaussians | None = None, line: float = 1.0
+) -> PictureRequest:
+    other = None if second is None else ReducedScene(second, "all")
+    return PictureRequest(camera, ReducedScene(scene, "all"), other, line)
+
+
+def step(of: PictureRequest, side: int = 400, moving: bool = False) -> DrawingStep[PictureRequest]:
+    return DrawingStep(of, 1, side, 1.0, moving, whole=not moving)
+
+
+def test_picture_is_the_render_of_its_view(scene, camera):
+    *bands, pixels = paint(step(request(camera, scene)))
+    assert len(bands) > 3 and all(band is None for band in bands)
+    view = ps.sample_views(scene, 1, 400, 300)[0]
+    assert np.abs(pixels - to_uint8(ps.render(scene, view)).astype(int)).max() <= 1
+
+
+def test_two_scenes_meet_at_the_line(scene, camera):
+    second = scene.replace(features_dc=-scene.features_dc)
+    *_, pixels = paint(step(request(camera, scene, second, 0.25)))
+    *_, first = paint(step(request(camera, scene)))
+    *_, other = paint(step(request(camera, second)))
+    assert np.abs(pixels[:, :97] - first[:, :97].astype(int)).max() <= 1
+    assert np.abs(pixels[:, 103:] - other[:, 103:].astype(int)).max() <= 1
+    assert (pixels[:, 100] == 255).all()
+
+
+def test_newer_request_ends_a_whole_picture_between_two_bands(scene, camera):
+    shown: queue.Queue[DrawingStep[PictureRequest]] = queue.Queue()
+    in_band, moved = threading.Event(), threading.Event()
+    given_up = []
+
+    def slow(of: DrawingStep[PictureRequest]) -> Iterator[np.ndarray | None]:
+        if not of.moving and of.number == 1:
+            try:
+                while True:
+                    in_band.set()
+                    moved.wait(30)
+                    yield None
+            finally:
+                given_up.append(of.number)
+        yield np.zeros((2, 2, 3), np.uint8)
+
+    painter = Painter(lambda pixels, of, seconds: shown.put(of), slow)
+    try:
+        painter.schedule.submit(request(camera, scene))
+        assert in_band.wait(30) and shown.get(timeout=30).moving
+        painter.schedule.submit(request(camera, scene))
+        moved.set()
+        steps = [shown.get(timeout=30)]
+        while steps[-1].moving:
+            steps.append(shown.get(timeout=30))
+    finally:
+        painter.close()
+    assert given_up == [1] and {of.number for of in steps} == {2} and steps[-1].side == 960
+
+
+def test_camera_without_a_place_does_not_end_the_drawing(scene, camera, caplog):
+    shown: queue.Queue[np.ndarray] = queue.Queue()
+    painter = Painter(lambda pixels, of, seconds: shown.put(pixels))
+    nowhere = ViewerCamera(torch.full((4, 4), torch.nan, dtype=torch.float64), 1.0, 1.0, torch.zeros(3), 0.01)
+    try:
+        painter.schedule.submit(request(nowhere, scene))
+        assert shown.get(timeout=30).shape == (1, 1, 3)
+        painter.schedule.submit(request(camera, scene), 64)
+        while (pixels := shown.get(timeout=30)).shape != (48, 64, 3):
+            pass
+        assert pixels.std() > 10
+    finally:
+        painter.close()
+    assert "cannot draw" in caplog.text and not painter._thread.is_alive()

@@ -54,10 +54,6 @@ def patient(scene, news) -> Iterator[Selection]:
     made.close()
 
 
-def test_all_is_shown_first(patient, scene):
-    assert same(patient.current.scene, scene) and patient.current.how == "all"
-
-
 @pytest.mark.parametrize("percent", [1, 10, 77, 99])
 def test_budget_acts_at_once_by_coverage(patient, scene, percent):
     patient.choose(percent)
@@ -107,13 +103,6 @@ def test_failed_merge_leaves_what_was_chosen_and_says_why(selection, news, monke
     selection.choose(50)
     news.wait(lambda: "no such thing" in selection.current.how)
     assert len(selection.current.scene) == 200
-
-
-def test_close_ends_the_thread(scene, news):
-    made = Selection(scene, ViewSource(scene), news, rest=0.0)
-    made.choose(10)
-    made.close()
-    assert not made._thread.is_alive()
 
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(scene, news):

@@ -1,13 +1,17 @@
-"""Camera paths go through the views they are made of, smoothly, upright, and where somebody has looked from."""
+"""Camera paths, made and saved."""
 
+import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.viewing import camera_path
+from pointsplat_ns.viewing.camera_path import read_path
 from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
 
 
@@ -58,21 +62,6 @@ def test_path_goes_exactly_through_every_pose(frames):
     assert at[0] == 0 and at[-1] == frames - 1 and bool((at.diff() > 0).all())
     assert torch.equal(path.Ks[at], views.Ks)
     assert_rigid(path)
-
-
-def test_path_is_smooth():
-    path = along(captured(), 400)
-    for values in (places(path), path.viewmats[:, :3, :3].flatten(1)):
-        steps = values.diff(dim=0).norm(dim=1)
-        jumps = values.diff(n=2, dim=0).norm(dim=1)
-        assert float(jumps.max()) < 0.5 * float(steps.max())
-        assert float(steps.max()) < 12 * float(steps.mean())
-
-
-def test_positions_stay_between_those_given():
-    views = captured()
-    path, given = places(along(views, 300)), places(views)
-    assert bool((path >= given.amin(0) - 1e-9).all() & (path <= given.amax(0) + 1e-9).all())
 
 
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
@@ -133,3 +122,86 @@ def test_no_views_or_frames_are_refused(path):
         path(captured()[:0], 5)
     with pytest.raises(ps.DataError, match="0 frames; expected at least 1"):
         path(captured(), 0)
+
+
+TURNED = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def saved(**changes) -> dict:
+    """What the viewer saves, with parts replaced; None leaves a part out."""
+    camera = {"camera_to_world": sum(TURNED, []), "fov": 60.0, "aspect": 1.5}
+    content = {
+        "default_fov": 75.0, "default_transition_sec": 2.0, "keyframes": [], "camera_type": "perspective",
+        "render_height": 40, "render_width": 60, "fps": 24.0, "seconds": 4.0, "is_cycle": False,
+        "smoothness_value": 0.0, "camera_path": [camera, {**camera, "fov": 90}],
+    }  # fmt: skip
+    return {name: value for name, value in {**content, **changes}.items() if value is not None}
+
+
+def written(content, folder: Path) -> Path:
+    path = folder / "path.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_cameras_are_those_that_nerfstudio_reads(tmp_path):
+    from nerfstudio.cameras.camera_paths import get_path_from_json
+
+    found, expected = read_path(written(saved(), tmp_path)), get_path_from_json(saved())
+    views = found.views
+    assert (len(views), views.width, views.height, found.fps) == (2, 60, 40, 24.0)
+    torch.testing.assert_close(viewmats_to_opengl(views.viewmats).float(), expected.camera_to_worlds)
+    torch.testing.assert_close(views.Ks.float(), expected.get_intrinsics_matrices())
+
+
+def one(**changes) -> dict:
+    """A saved path of one camera, changed."""
+    return saved(camera_path=[{**saved()["camera_path"][0], **changes}])
+
+
+def moved(row: int, column: int, value: float) -> dict:
+    values = [list(line) for line in TURNED]
+    values[row][column] = value
+    return one(camera_to_world=sum(values, []))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[" * 100_000, "cannot be read as JSON"),
+        ("\ud800".encode("utf-16", "surrogatepass").decode("latin-1"), "cannot be read as JSON"),
+        ("[]", "no camera path"),
+        (saved(camera_path=[]), "no camera path"),
+        (saved(camera_type="equirectangular"), "cameras are 'equirectangular'; expected perspective"),
+        (saved(render_width=0), "render_width is 0"),
+        (saved(render_height=10**9), "render_height is 1000000000"),
+        (saved(render_height="40"), "render_height is 40"),
+        (saved(camera_path=[3]), "camera 0 has no pose"),
+        (one(camera_to_world=[1.0] * 12), "camera 0 has no pose"),
+        (moved(0, 3, math.nan), "camera 0 has no pose"),
+        (moved(1, 3, 1e300), "farther than 1e.09 units"),
+        (moved(0, 0, 1.0), "no rigid motion"),
+        (moved(2, 2, -1.0), "no rigid motion"),
+        (one(fov=0), "fov of camera 0 is 0"),
+        (one(fov=180), "fov of camera 0 is 180"),
+    ],
+)
+def test_anything_else_is_refused_in_one_line(content, message, tmp_path):
+    path = written(content, tmp_path)
+    with pytest.raises(ps.DataError, match=message) as raised:
+        read_path(path)
+    assert str(raised.value).startswith(str(path)) and "\n" not in str(raised.value)
+
+
+def test_missing_and_huge_files_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ps.SceneError, match="no such file; expected a camera path"):
+        read_path(tmp_path / "nothing.json")
+    monkeypatch.setattr(camera_path, "CAMERA_PATH", camera_path.PathSettings(bytes=10))
+    with pytest.raises(ps.DataError, match="expected a camera path of at most"):
+        read_path(written(saved(), tmp_path))
+
+
+def test_crop_is_said_to_be_left_out(tmp_path, caplog):
+    read_path(written(saved(crop={"crop_scale": [1, 1, 1]}), tmp_path))
+    assert "its crop is not applied" in caplog.text

@@ -1,14 +1,15 @@
-"""What is written is what was drawn, and nothing is left of what was not finished."""
+"""Videos, also of two scenes side by side."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
 
 import pointsplat_ns as ps
-from making import decoded
+from making import cloud, decoded
 from pointsplat_ns.viewing import video
+from pointsplat_ns.viewing.film import Wipe, with_labels
 from pointsplat_ns.viewing.video import write_frames
 
 
@@ -48,16 +49,6 @@ def test_video_plays_everywhere(tmp_path):
         assert int(stream.codec_context.colorspace) == 1, "BT.709"
     content = (tmp_path / "film.mp4").read_bytes()
     assert content.index(b"moov") < content.index(b"mdat")
-
-
-def test_folder_and_picture_hold_the_pixels_themselves(tmp_path):
-    frames = drawn(3)
-    assert write_frames(frames, tmp_path / "frames", 12) == 3
-    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [f"frame_0000{i}.png" for i in range(3)]
-    assert all((np.asarray(Image.open(tmp_path / f"frames/frame_0000{i}.png")) == frames[i]).all() for i in range(3))
-    assert write_frames(frames[:1], tmp_path / "one.png", 12) == 1
-    assert (np.asarray(Image.open(tmp_path / "one.png")) == frames[0]).all()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "one.png"]
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "frames", "deeper/frames"])
@@ -114,3 +105,32 @@ def test_missing_encoder_is_named(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="has no h264_of_nobody; expected its wheel"):
         write_frames(drawn(1), tmp_path / "film.mp4", 12)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.fixture(scope="module")
+def scenes() -> tuple[ps.Gaussians, ps.Gaussians]:
+    first = cloud(300)
+    return first, first.replace(features_dc=-first.features_dc)
+
+
+@pytest.fixture(scope="module")
+def view(scenes) -> ps.View:
+    return ps.sample_views(scenes[0], 1, 70, 44)[0]
+
+
+@pytest.mark.parametrize("column", [0, 1, 8, 33, 64, 69, 70])
+def test_each_side_of_a_wipe_is_the_render_of_its_scene(scenes, view, column):
+    wipe = Wipe(*scenes, view, column)
+    picture = torch.cat([wipe.draw(row, row + 1) for row in range(wipe.rows)])
+    first, second = (ps.render(scene, view) for scene in scenes)
+    expected = torch.cat([first[:, :column], second[:, column:]], dim=1)
+    torch.testing.assert_close(picture, expected, rtol=0, atol=1e-5)
+
+
+def test_labels_stand_at_the_top_of_their_sides():
+    blank = np.full((200, 400, 3), 128, np.uint8)
+    both = with_labels(blank, ["dense", "ein Zehntel, 小"], 200) != 128
+    assert both[:40, :200].any() and both[:40, 200:].any() and not both[40:].any()
+    assert not (with_labels(blank, ["", "second"], 200)[:, :200] != 128).any()
+    narrow = with_labels(blank, ["first", "second"], 30) != 128
+    assert not narrow[:, :200].any() and narrow[:, 200:].any(), "no room on the left"

@@ -20,7 +20,6 @@ from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
 from pointsplat_ns.refiner.encoder import BatchNorm
-from pointsplat_ns.system import processes
 from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
@@ -240,14 +239,6 @@ def test_batch_norm_is_that_of_all_points(together):
     torch.testing.assert_close(torch.cat([part["norm of a point"] for part in found]), pair, **tight)
 
 
-def test_numbers_of_several_processes_become_one(together):
-    for part in together[0]:
-        assert part["gathered"] == [0, "x", 1, "x"]
-        assert {name: float(value) for name, value in part["means"].items()} == {"l1": 1.5}
-        assert part["averaged"][0].tolist() == [0.25, 0.25], "(0 + 2) / 2 processes / 4 steps"
-        assert part["averaged"][1].tolist() == [0.0] * 3
-
-
 def test_ns_train_under_torchrun_is_one_training(tmp_path):
     write_rooms(tmp_path / "rooms")
     asked = [
@@ -275,14 +266,6 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
         config.set_timestamp()
     with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
         config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
-
-
-def test_a_process_alone_is_left_as_it_is():
-    assert (processes.rank(), processes.world_size(), gathered([1])) == (0, 1, [1])
-    assert means_over_ranks({"psnr": torch.tensor(3.0)}, ("l1", "psnr")) == {"psnr": torch.tensor(3.0)}
-    parameter = nn.Parameter(torch.zeros(2))
-    average_gradients([parameter], steps=3)
-    assert parameter.grad is None
 
 
 if __name__ == "__main__":

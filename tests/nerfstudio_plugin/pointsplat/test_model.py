@@ -1,25 +1,32 @@
-"""The model: scenes pruned once and refined, and what a step costs."""
+"""The model: config, recipe, evaluation."""
 
+import copy
+import json
 import math
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
 from unittest import mock
 
+import cv2
 import pytest
 import torch
+import tyro
+from nerfstudio.utils.eval_utils import eval_setup
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import pipeline_of, run_of, same
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_scene
-from pointsplat_ns.metrics.lpips import load_lpips
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import SHARED_DATA, parsed_by_ns_train, pipeline_of, run_of, same, small_config
+from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
-from pointsplat_ns.pruning import METHODS, prune, score_of, select
+from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import (
+    RECIPE,
+    refiner_command,
+    scene_settings,
+)
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig
+from pointsplat_ns.pruning import METHODS, score_of, select
 from pointsplat_ns.rasterizer import rasterization
-
-
-def test_by_default_scenes_are_merged(trained_walls):
-    assert pointsplat_config().pipeline.model.by == "merge"
-    wanted = prune(read_scene(run_of(trained_walls, "wall-a")), 0.25, "merge")
-    assert same(pipeline_of(trained_walls, by="merge", keep=0.25).model.pruned_scene(0).pruned, wanted)
 
 
 def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls):
@@ -84,22 +91,157 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     assert not any("lpips" in name for name in pipeline.state_dict())
 
 
-def test_what_is_shown_follows_the_weights(trained, trained_walls):
-    pipeline = pipeline_of(trained_walls)
-    model = pipeline.model
+MODEL = "--pipeline.model."
 
-    def shown_is_current() -> bool:
-        with torch.no_grad():
-            return same(model.eval().gaussians, model.refiner(model.pruned_scene(0).pruned))
 
-    untrained = model.gaussians
-    assert shown_is_current()
-    optimizer = torch.optim.SGD(model.refiner.parameters(), lr=10.0)
-    _, losses, _ = pipeline.train().get_train_loss_dict(0)
-    losses["l1"].backward()
-    optimizer.step()
-    assert shown_is_current() and not same(model.gaussians, untrained)
-    state = torch.load(next(trained[0].get_checkpoint_dir().iterdir()), weights_only=True)["pipeline"]
-    stepped = model.gaussians
-    pipeline.load_pipeline(state, 9)
-    assert shown_is_current() and not same(model.gaussians, stepped)
+def test_every_option_of_the_model_is_read_in_a_training(trained_walls, no_lpips):
+    config = pointsplat_config()
+    kind = tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[type(config)]]  # as ns-train takes it
+    words = [name for action in tyro.extras.get_parser(kind, default=config)._actions for name in action.option_strings]
+    options = {word.removeprefix(MODEL).replace("-", "_") for word in words if word.startswith(MODEL)}
+    assert {"keep", "size", "quality"} <= options
+    read = set()
+
+    @dataclass
+    class Recorded(PointSplatModelConfig):
+        def __getattribute__(self, name: str):
+            read.add(name)
+            return super().__getattribute__(name)
+
+    config = small_config(trained_walls, Path("unused"), 1, lpips_weight=0.1)
+    config.pipeline.model = Recorded(**{name: getattr(config.pipeline.model, name) for name in options})
+    read.clear()
+    config.pipeline.setup(device="cpu", test_mode="val").get_train_loss_dict(0)
+    assert options <= read
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lpips_weight": 0.0, "lpips_net": "vgg"}, "lpips-net vgg: at --pipeline.model.lpips-weight 0"),
+        ({"lpips_weight": -0.1}, "lpips-weight -0.1: expected a finite number, 0 or above"),
+        ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
+        ({"backend": "gsplat", "compiled": True}, "compiled True: has no effect on --pipeline.model.backend gsplat"),
+        ({"backend": "gsplat", "quality": "fast"}, "quality fast: has no effect on --pipeline.model.backend gsplat"),
+        ({"by": "merge", "opacity_weight": 0.3}, "opacity weight 0.3: merge does not weigh opacity"),
+        ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
+        ({"by": "beauty"}, "no method is called 'beauty'; expected one of merge"),
+        ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
+        ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
+        ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused_and_leave_no_folder(trained_walls, tmp_path, changes, message):
+    config = small_config(trained_walls, tmp_path / "outputs", 1, **changes)
+    config.save_config()
+    with pytest.raises(PointSplatError, match=message):
+        config.setup(local_rank=0, world_size=1).setup()
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_the_scene_command_says_what_the_settings_say():
+    settings = scene_settings(RECIPE.train_seeds[0])
+    config = parsed_by_ns_train(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
+    model = config.pipeline.model
+    assert config.method_name == "splatfacto-cpu" and config.experiment_name == settings.name
+    assert config.max_num_iterations == settings.steps
+    assert model.densify_grad_thresh == pytest.approx(settings.densify_grad_thresh, rel=0.05)  # two digits
+    assert model.cull_alpha_thresh == settings.cull_alpha_thresh
+    assert model.rasterize_mode == ("antialiased" if settings.antialiased else "classic")
+    assert model.use_scale_regularization == settings.scale_regularization
+    assert config.pipeline.datamanager.dataparser.num_seed_points == settings.seed_points
+    assert config.data == Path("rooms/a b")
+
+
+def test_the_refiner_command_holds_the_unseen_rooms_out():
+    config = parsed_by_ns_train(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
+    manager, model = config.pipeline.datamanager, config.pipeline.model
+    assert config.method_name == "pointsplat" and config.max_num_iterations == 70
+    assert manager.eval_scenes == tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
+    assert (manager.supervision, manager.seed) == ("dense", 3)
+    assert model.keep == RECIPE.keep and model.size == "tiny" and model.by == "merge"
+    assert model.pruned_folder == Path("o/pruned")
+
+
+LPIPS_WEIGHTS = SHARED_DATA / "weights"
+
+VARIANTS = ("dense", "pruned", "refined")
+
+
+def test_a_scene_trained_again_since_is_not_the_one_that_the_network_has_seen(trained, trained_walls, tmp_path):
+    config, _, _ = trained
+    moved = tmp_path / "moved"
+    shutil.copytree(trained_walls, moved)
+    (again,) = (moved / "wall-a" / "splatfacto-cpu").iterdir()
+    text = (again / "config.yml").read_text()
+    other = copy.deepcopy(config)
+    other.pipeline.datamanager.data = moved
+    pipeline = other.pipeline.setup(device="cpu", test_mode="test")
+    state = torch.load(next(config.get_checkpoint_dir().iterdir()), weights_only=True)
+    pipeline.load_pipeline(state["pipeline"], state["step"])
+    seen = [scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes]
+    assert seen == [True, False], "a run is the same wherever its folder is"
+    timestamp = pipeline.datamanager.scenes[0].run.timestamp
+    (again / "config.yml").write_text(text.replace(timestamp, "2031-01-01_000000"))
+    pipeline = other.pipeline.setup(device="cpu", test_mode="test")
+    pipeline.load_pipeline(state["pipeline"], state["step"])
+    assert not any(scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes)
+
+
+@pytest.fixture(scope="module")
+def report(evaluated, tmp_path_factory) -> tuple[dict, Path]:
+    """An evaluation, with LPIPS where its weights are at hand, and the folder of its pictures."""
+    folder = tmp_path_factory.mktemp("pictures")
+    with pytest.MonkeyPatch.context() as patch:
+        if LPIPS_WEIGHTS.exists():
+            patch.setenv("POINTSPLAT_LPIPS_WEIGHTS", str(LPIPS_WEIGHTS))
+        else:
+            unavailable = mock.Mock(side_effect=LpipsUnavailable("no weights here"))
+            patch.setattr("pointsplat_ns.metrics.lpips.cached_lpips", unavailable)
+        return evaluated.get_average_eval_image_metrics(output_path=folder, get_std=True), folder
+
+
+def test_a_report_says_of_each_scene_its_sizes_quality_speed_and_whether_it_was_trained_on(evaluated, report):
+    found, folder = report
+    for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
+        scene, block = evaluated.model.pruned_scene(index), found["scenes"][name]
+        assert (block["views"], block["seen_in_training"]) == (2, seen)
+        assert block["seconds"].keys() == {"prune", "refine"} and block["dense"]["gaussians"] == scene.dense_count
+        assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
+        assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
+        assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
+        assert block["dense"]["psnr"] > block["pruned"]["psnr"], "half the Gaussians of a wall leave holes"
+        values = [block[variant]["lpips"] for variant in VARIANTS]
+        if LPIPS_WEIGHTS.exists():
+            assert all(0 < value < 2 for value in values) and "lpips_note" not in found
+        else:
+            assert values == [None] * 3 and found["lpips_note"] == "no weights here"
+    seen, unseen = (found["scenes"][name]["refined"]["psnr"] for name in ("wall-a", "wall-b"))
+    means = {key: found[key]["refined"]["psnr"] for key in ("average", "average_seen", "average_unseen")}
+    assert means == {"average": pytest.approx((seen + unseen) / 2), "average_seen": seen, "average_unseen": unseen}
+    assert found["psnr"] == unseen and found["psnr_std"] > 0
+    network = {"size": "tiny", "encoder": "dual", "use_appearance": True, "use_position": True, "norm": "scene"}
+    assert found["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
+    assert sorted(path.name for path in folder.iterdir()) == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
+    assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), "photo, dense, pruned, refined"
+
+
+def test_dense_is_judged_as_its_own_run_judges_it(evaluated, trained_walls, no_lpips):
+    report = evaluated.get_average_eval_image_metrics()
+    for name in ("wall-a", "wall-b"):
+        own = eval_setup(run_of(trained_walls, name) / "config.yml")[1].get_average_eval_image_metrics()
+        # dB; the same pictures but for rounding of float32, in which a SH coefficient's colour is computed
+        assert report["scenes"][name]["dense"]["psnr"] == pytest.approx(own["psnr"], abs=1e-3)
+        assert report["scenes"][name]["dense"]["ssim"] == pytest.approx(own["ssim"], abs=1e-4)
+
+
+def test_a_distorted_scene_of_degree_0_is_judged_as_its_own_run_judges_it(lens_run, no_lpips):
+    own = eval_setup(lens_run / "config.yml")[1].get_average_eval_image_metrics()
+    pipeline = pipeline_of(lens_run)
+    assert pipeline.datamanager.scenes[0].read_dense().sh_degree == 0
+    report = pipeline.get_average_eval_image_metrics()
+    # dB; float32 rounding, for a colour logit has become a SH coefficient of the same colour
+    assert report["average"]["dense"]["psnr"] == pytest.approx(own["psnr"], abs=1e-3)
+    assert not torch.equal(pipeline.datamanager.scenes[0].run.transform, torch.eye(4)[:3]), "proves too little"

@@ -7,18 +7,13 @@ from unittest import mock
 
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetppDataParserConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import run_of, without_data
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, dataparser_of
-from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 
 NUM_TRAIN, NUM_HELD_OUT = 9, 2  # of the wall's 11 frames, every tenth held out
 
@@ -40,22 +35,6 @@ def make_run(folder: Path, wall_config, scene: Path, change=lambda config: None)
 
 def scene_of(run: Path) -> TrainedScene:
     return TrainedScene("scene", open_run(run), MemoryCache(1 << 20))
-
-
-def test_a_run_a_config_and_a_checkpoint_each_name_one_scene(trained_walls):
-    run = run_of(trained_walls, "wall-a")
-    for path in (run, run / "config.yml", next((run / "nerfstudio_models").iterdir())):
-        manager = manager_of(path)
-        assert [scene.name for scene in manager.scenes] == ["wall-a"]
-        assert manager.train_indices == manager.eval_indices == [0] and manager.shown == 0
-
-
-def test_held_out_scenes_are_evaluated_and_shown_and_never_trained_on(trained_walls):
-    manager = manager_of(trained_walls, eval_scenes=("wall-b",))
-    assert manager.train_indices == [0] and manager.eval_indices == [1] and manager.shown == 1
-    assert {manager.next_train(step)[0] for step in range(6)} == {0}
-    assert {manager.next_eval(step)[0] for step in range(6)} == {1}
-    assert "train_frames" not in manager_of(trained_walls, eval_scenes=("wall-b",)).scenes[0].__dict__
 
 
 def test_what_cannot_be_a_scene_says_what_is_wrong(trained_walls, tmp_path):
@@ -80,38 +59,6 @@ def test_a_run_of_another_method_is_refused_when_it_is_named_itself(wall_config,
     run = make_run(tmp_path, wall_config, wall_scene, nerf)
     with pytest.raises(SceneError, match="method nerfacto; expected a trained Splatfacto run"):
         manager_of(run)
-
-
-def test_the_dataparser_is_set_up_as_it_was_but_for_seed_points(wall_config, wall_scene, tmp_path):
-    def change(config):
-        config.pipeline.datamanager.dataparser = ReplicaDataParserConfig(
-            frame_stride=2, eval_frames=(4,), scale_factor=2.5, pixel_centers="half"
-        )
-
-    run = make_run(tmp_path, wall_config, wall_scene, change)
-    (run / "dataparser_transforms.json").write_text(json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 2.5}))
-    config = dataparser_of(open_run(run)).config
-    settings = {"frame_stride": 2, "eval_frames": (4,), "scale_factor": 2.5, "pixel_centers": "half"}
-    assert config == ReplicaDataParserConfig(data=wall_scene, load_seed_points=False, **settings)
-    scene = scene_of(run)
-    names = [Path(p).stem for p in scene.train_frames.dataset.image_filenames]
-    assert names == [f"frame{i:06d}" for i in (0, 2, 6, 8, 10)]
-    assert [Path(p).stem for p in scene.eval_frames.dataset.image_filenames] == ["frame000004"]
-    # The wall's cameras stand at z = -2 scene units.
-    assert scene.train_frames.dataset.cameras.camera_to_worlds[:, 2, 3].tolist() == [-5.0] * 5
-    assert "points3D_xyz" not in scene.train_frames.dataset.metadata
-
-
-@pytest.mark.parametrize(
-    ("config", "names"),
-    [(ScanNetppDataParserConfig(), ()), (NerfstudioDataParserConfig(load_3D_points=True), ("load_3D_points",))],
-    ids=["scannetpp-data", "nerfstudio-data"],
-)
-def test_nerfstudios_own_dataparsers_are_known(wall_config, wall_scene, tmp_path, config, names):
-    run = make_run(tmp_path, wall_config, wall_scene, lambda c: setattr(c.pipeline.datamanager, "dataparser", config))
-    found = dataparser_of(open_run(run)).config
-    assert type(found) is type(config) and found.data == wall_scene
-    assert not any(getattr(found, name) for name in names), "seed points are of no use to a trained scene"
 
 
 def test_an_unknown_dataparser_and_an_unknown_setting_are_refused(wall_config, wall_scene, tmp_path):
@@ -155,34 +102,9 @@ def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(wall_c
         _ = scene_of(run).train_frames
 
 
-def test_photos_have_the_resolution_that_the_run_was_trained_at(wall_config, wall_scene, tmp_path):
-    run = make_run(
-        tmp_path, wall_config, wall_scene, lambda c: setattr(c.pipeline.datamanager, "camera_res_scale_factor", 0.5)
-    )
-    scene = scene_of(run)
-    for frames, count in ((scene.train_frames, NUM_TRAIN), (scene.eval_frames, NUM_HELD_OUT)):
-        camera, data = frames[0]
-        assert len(frames) == count
-        assert data["image"].shape == (24, 32, 3)
-        assert (int(camera.width), int(camera.height), float(camera.fx)) == (32, 24, 30.0)  # of 64, 48 and 60
-        same = InputDataset(scene._dataparser.get_dataparser_outputs("train"), 0.5)
-        if frames is scene.train_frames:
-            torch.testing.assert_close(data["image"].float() / 255, same.get_image_float32(0), atol=0, rtol=0)
-
-
 def photos_of(manager, step):
     scene, frames = manager.next_train(step)
     return scene, [data["image_idx"] for _, data in frames]
-
-
-def test_each_epoch_has_each_scene_once_and_photos_differ(trained_walls):
-    manager = manager_of(trained_walls)
-    steps = [photos_of(manager, step) for step in range(40)]
-    for i in range(0, 40, 2):
-        assert {steps[i][0], steps[i + 1][0]} == {0, 1}
-    assert len({steps[i][0] for i in range(0, 40, 2)}) == 2, "the order of scenes varies"
-    assert all(len(set(photos)) == 2 for _, photos in steps)
-    assert {i for _, photos in steps for i in photos} == set(range(NUM_TRAIN)), "every training photo has its turn"
 
 
 def test_a_step_gets_the_same_whatever_came_before_it_and_processes_share_it_out(trained_walls):
@@ -195,12 +117,3 @@ def test_a_step_gets_the_same_whatever_came_before_it_and_processes_share_it_out
         shares = [config.setup(test_mode="val", world_size=size, local_rank=rank) for rank in range(size)]
         together = [photos_of(share, step) for step in range(12 // size) for share in shares]
         assert together == alone
-
-
-def test_inference_needs_no_photos(trained_walls, tmp_path):
-    without_data(trained_walls, tmp_path / "runs")
-    with pytest.raises(SceneError, match="gone_from_here.*is not there"):
-        manager_of(tmp_path / "runs")
-    manager = ScenesDataManagerConfig(data=tmp_path / "runs").setup(test_mode="inference")
-    assert manager.train_dataset is None and manager.eval_dataset is None
-    assert len(manager.scenes[0].read_dense()) > 0

@@ -14,7 +14,6 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from broken_steps import broken
 from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES, pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 
 
@@ -154,38 +153,6 @@ def test_an_accumulation_that_means_nothing_is_refused_and_leaves_no_folder(thre
     with pytest.raises(PointSplatError, match="--gradient-accumulation-steps .*expected all or one of encoder"):
         config.setup(local_rank=0, world_size=1).setup()
     assert not (tmp_path / "outputs").exists()
-
-
-def fitted_of(config):
-    with mock.patch.object(config, "_target", lambda fitted, **_: fitted):
-        return config.setup().optimizers
-
-
-def test_published_rates_are_taken_but_for_what_was_set_by_hand():
-    config = pointsplat_config()
-    assert {n: g["optimizer"].lr for n, g in fitted_of(config).items()} == REFINER_RATES
-    config.optimizers["backbone"]["optimizer"].lr = 7e-4
-    expected = {"paper": dict.fromkeys(REFINER_RATES, 1e-5), "authors": dict.fromkeys(REFINER_RATES, 3e-5)}
-    expected["authors"] |= {"means": 1e-5, "scales": 1e-5, "quats": 1e-5, "features_rest": 1e-6}
-    for config.rates in ("paper", "authors"):
-        fitted = fitted_of(config)
-        assert {n: g["optimizer"].lr for n, g in fitted.items()} == expected[config.rates] | {"backbone": 7e-4}
-        assert all(g["optimizer"].eps == 1e-15 and g["optimizer"].max_norm == 2.0 for g in fitted.values())
-
-
-@pytest.mark.parametrize("steps", [1, 10, 500])
-def test_the_step_schedule_divides_by_ten_at_sixty_percent(steps):
-    config = dense_config(Path("unused"), Path("unused"), steps)
-    config.schedule = "step"
-    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1e-5)
-    schedule = fitted_of(config)["encoder"]["scheduler"].setup().get_scheduler(optimizer, 1e-5)
-    rates = []
-    for _ in range(steps):
-        rates.append(optimizer.param_groups[0]["lr"])
-        optimizer.step(), schedule.step()
-    at = max(1, round(0.6 * steps))
-    assert rates[:at] == [1e-5] * at
-    assert all(math.isclose(rate, 1e-6, rel_tol=1e-9) for rate in rates[at:])
 
 
 def test_a_part_is_due_after_its_own_number_of_steps_that_count_also_where_saved_in_between():

@@ -1,9 +1,5 @@
 """What makes a training vary (budgets, transforms, rates that fit), and pruned scenes kept on disk."""
 
-import math
-import shutil
-from pathlib import Path
-
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
@@ -11,9 +7,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, move_zero_layers, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey, read_pruned, stored_path, write_pruned
 from pointsplat_ns.pruning import PruneSettings
@@ -98,52 +93,6 @@ def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_p
     save_file({"means": torch.zeros(1, 3)}, path)
     with pytest.raises(SceneError, match="format None; expected 'pointsplat-pruned/1'"):
         read_pruned(path)
-
-
-def test_a_stored_scene_lies_in_the_folder_and_is_told_apart_by_content_and_settings(tmp_path):
-    usual = ("room", "a5" * 32, PruneSettings(0.5, "paper"))
-    settings = ((0.25, "paper"), (0.5, "merge"), (0.5, "paper", 0.7))
-    others = [("../../etc/passwd", *usual[1:]), ("room", "5a" * 32, usual[2])]
-    others += [("room", usual[1], PruneSettings(*some)) for some in settings]
-    paths = [stored_path(tmp_path, *key) for key in (usual, usual, *others)]
-    assert all(path.parent == tmp_path for path in paths) and paths[0] == paths[1] and len(set(paths)) == 6
-
-
-def trained_anew(run: Path) -> None:
-    """Another scene in the place of a run's: same folder, name, time and step."""
-    (checkpoint,) = (run / "nerfstudio_models").iterdir()
-    state = torch.load(checkpoint, weights_only=True)
-    means = state["pipeline"]["_model.gauss_params.means"]
-    state["pipeline"]["_model.gauss_params.means"] = means + 1.0
-    torch.save(state, checkpoint)
-
-
-def test_a_scene_that_is_trained_again_under_the_same_name_is_pruned_anew(trained_walls, tmp_path):
-    shutil.copytree(trained_walls, tmp_path / "runs")
-
-    def pruned():
-        config = small_config(tmp_path / "runs", tmp_path, 1, pruned_folder=tmp_path / "pruned")
-        pipeline = config.pipeline.setup(device="cpu", test_mode="test")
-        return pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0]
-
-    before, scene = pruned()
-    (run,) = (tmp_path / "runs" / "wall-a" / "splatfacto-cpu").iterdir()
-    trained_anew(run)
-    after, again = pruned()
-    assert again.identity == scene.identity, "proves too little"
-    torch.testing.assert_close(after.means, before.means + 1.0)
-
-
-def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls, tmp_path):
-    config = small_config(trained_walls, tmp_path, 1)
-    config.rate_factor = 3.0
-    trainer = config.setup(local_rank=0, world_size=1)
-    for name, group in trainer.config.optimizers.items():
-        assert group["optimizer"].lr == pytest.approx(3 * REFINER_RATES[name])
-    assert config.optimizers["encoder"]["optimizer"].lr == REFINER_RATES["encoder"], "the config given is left as it is"
-    for config.rate_factor in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(PointSplatError, match="--rate-factor"):
-            config.setup(local_rank=0, world_size=1)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])

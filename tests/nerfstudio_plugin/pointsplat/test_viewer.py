@@ -1,6 +1,5 @@
 """What nerfstudio's viewer and the exporters get of the model."""
 
-import copy
 from unittest import mock
 
 import matplotlib.image
@@ -12,7 +11,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.scripts.render import DatasetRender
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config, pipeline_of, same
+from making import fast_config, same
 from pointsplat_ns.cli.scene_options import claims_until_the_end
 from pointsplat_ns.io import read_ply
 
@@ -33,17 +32,6 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     assert model.colors.shape == (model.num_points, 3)
     assert len(evaluated.datamanager.train_dataset) == 9 and len(evaluated.datamanager.eval_dataset) == 2
     assert model.get_outputs(mock.Mock(spec=[])) == {} and isinstance(camera, Cameras)
-
-
-def test_looking_at_a_training_does_not_disturb_it(trained_walls):
-    pipeline = pipeline_of(trained_walls, norm="batch")
-    expected = pipeline.model.means
-    pipeline.train()
-    before, drawn = copy.deepcopy(pipeline.model.refiner.state_dict()), torch.get_rng_state()
-    assert torch.equal(pipeline.model.means, expected), "refined as in training, where paths are dropped at random"
-    assert pipeline.model.training and pipeline.model.refiner.training
-    assert torch.equal(torch.get_rng_state(), drawn), "the training would have taken other random numbers"
-    assert all(torch.equal(before[name], value) for name, value in pipeline.model.refiner.state_dict().items())
 
 
 def test_a_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background(evaluated):

@@ -11,7 +11,6 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
     CappedStrategy,
-    drawn,
     grown_number,
     position_noise,
     replaced,
@@ -19,7 +18,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import at_most, random_seeds_near_cameras
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import random_seeds_near_cameras
 
 SEED = 20
 
@@ -54,13 +53,6 @@ def test_opacity_and_size_are_shared_as_the_paper_has_it(opacity, copies, dtype)
     assert moves.tolist()[0] == pytest.approx([math.log(factor)] * 3, abs=5e-6 if dtype == torch.float32 else 1e-11)
 
 
-@pytest.mark.parametrize("logit", [-math.inf, -200.0, 40.0, math.inf])
-def test_opacities_of_0_and_1_are_shared_as_finite_ones(logit):
-    opacities, scales = shared_opacity(torch.tensor([logit]), torch.zeros(1, 3), torch.tensor([7]))
-    assert opacities.isfinite().all() and scales.isfinite().all()
-    assert float(opacities) < (0 if logit < 0 else 16)
-
-
 def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
     generator = torch.Generator().manual_seed(SEED)
     scales = torch.randn(6, 3, generator=generator, dtype=torch.float64)
@@ -77,13 +69,6 @@ def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
     torch.manual_seed(SEED)
     single = position_noise(scales.float(), quats.float(), opacities.float())
     assert single.dtype == torch.float32 and single.isfinite().all()
-
-
-def test_indices_are_drawn_in_proportion_to_weights_and_never_of_weight_0():
-    torch.manual_seed(SEED)
-    found = torch.bincount(drawn(torch.tensor([0.0, 1.0, 0.0, 3.0, 0.0]), 40_000), minlength=5) / 40_000
-    assert found[[0, 2, 4]].sum() == 0
-    assert float(found[3]) == pytest.approx(0.75, abs=0.01)  # 4.6 standard deviations
 
 
 def test_the_number_grows_by_5_percent_or_as_fast_as_needed_and_is_reached_exactly():
@@ -201,15 +186,6 @@ def test_random_points_of_a_cap_are_uniform_in_contracted_space():
         assert share == pytest.approx((contracted / 1.8) ** 3, abs=0.0125)  # five standard deviations
     near, _ = random_seeds_near_cameras(SplatfactoCpuModelConfig(num_random=1000, random_scale=0.5))
     assert float(near.norm(dim=1).max()) <= 1 + 1e-5
-
-
-def test_seed_points_are_chosen_at_random_with_their_colours():
-    points, colors = torch.rand(50, 3), torch.rand(50, 3)
-    chosen, shades = at_most(20, points, colors)
-    assert chosen.shape == (20, 3) and len(chosen.unique(dim=0)) == 20
-    rows = [int((points == point).all(1).nonzero()) for point in chosen]
-    assert torch.equal(colors[rows], shades) and rows != sorted(rows)
-    assert at_most(50, points, colors)[0] is points and at_most(20, points, colors[:0])[1].shape == (0, 3)
 
 
 def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():

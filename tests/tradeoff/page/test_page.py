@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import math
 import re
 import shutil
 from dataclasses import replace
@@ -14,14 +13,12 @@ import pytest
 from PIL import Image
 
 import pointsplat_ns as ps
-from html_parts import hashed, names_nothing_outside, parts_of, policy_of
+from html_parts import names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.pages import pictures
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
-from pointsplat_ns.tradeoff import page as page_module
 from pointsplat_ns.tradeoff.page import write_sweep_page
-from pointsplat_ns.tradeoff.points import ImageMetrics, flight_path, picture_path
+from pointsplat_ns.tradeoff.points import flight_path, picture_path
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -30,22 +27,6 @@ HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
 @pytest.fixture(scope="module")
 def written(make_page) -> Path:
     return make_page()
-
-
-def test_page_names_nothing_outside_of_itself(written):
-    names_nothing_outside(written)
-
-
-def test_policy_lets_only_the_scripts_and_styles_of_the_page_run(written):
-    parts = parts_of(written)
-    assert policy_of(parts) == {
-        "default-src": "'none'",
-        "img-src": "data:",
-        "style-src": hashed(parts.inside["style"][0]),
-        "script-src": hashed(parts.inside["script"][1]),
-        "base-uri": "'none'",
-        "form-action": "'none'",
-    }
 
 
 def test_texts_of_strangers_are_shown_and_never_run(make_page, sweep):
@@ -79,55 +60,6 @@ def test_page_has_every_point_and_view(written, sweep):
 
 def decoded(uri: str) -> Image.Image:
     return Image.open(io.BytesIO(base64.b64decode(uri.partition("base64,")[2], validate=True)))
-
-
-def test_error_maps_are_those_of_the_lossless_pictures(sweep, tmp_path, monkeypatch):
-    measured, folder = sweep
-    monkeypatch.setattr(page_module, "fit", lambda sources, *_: ([str(int(s().sum())) for s in sources], "sums"))
-    [shown, *_] = parts_of(write_sweep_page(measured, folder, tmp_path / "sums.html")).data["pictures"]
-    for point in measured.points[1:]:
-        for reference, other in (("renders", "dense"), ("photos", "photo")):
-            a, b = (pictures.read_png(picture_path(folder, 0, key), 64, 48) for key in (point.key, other))
-            assert shown[f"{reference}:{point.key}"] == str(pictures.error_map(a, b).sum())
-
-
-def test_scripts_are_given_what_was_measured(written, sweep):
-    points = parts_of(written).data["points"]
-    for point, shown in zip(sweep[0].points, points, strict=True):
-        assert float(shown["renders"]["psnr"]) == point.against_dense.psnr
-        assert shown["photos"]["psnr"] == point.against_photos.psnr and shown["photos"]["lpips"] is None
-    assert points[0]["renders"]["psnr"] == "Infinity", "JSON has no infinite numbers"
-
-
-def test_page_without_photos_and_with_lpips(sweep, tmp_path):
-    measured, folder = sweep
-    bare = tmp_path / "bare"
-    shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("*_photo.png"))
-    points = [
-        replace(p, against_photos=None, against_dense=replace(p.against_dense, lpips=1 - p.share))
-        for p in measured.points
-    ]
-    parts = parts_of(write_sweep_page(replace(measured, points=tuple(points)), bare, tmp_path / "bare.html"))
-    radios = {(a["name"], a["value"]) for tag, a in parts.elements if tag == "input" and a.get("type") == "radio"}
-    assert ("metric", "lpips") in radios and not [name for name, _ in radios if name == "reference"]
-    assert not [name for view in parts.data["pictures"] for name in view if "photo" in name]
-    assert "photos" not in " ".join(header_of(tmp_path / "bare.html"))
-    assert "at least 36.1 dB against the dense scene's renders" in (tmp_path / "bare.html").read_text("utf-8")
-    assert "LPIPS, renders" in header_of(tmp_path / "bare.html")
-
-
-def header_of(path: Path) -> list[str]:
-    head = path.read_text("utf-8").partition("<thead>")[2].partition("</thead>")[0]
-    return re.findall(r"<button[^>]*>(.*?)</button>", head)
-
-
-def test_table_says_what_is_infinite_and_what_is_unknown(make_page, sweep):
-    first, second, *others = sweep[0].points
-    unknown = replace(second, against_photos=None, against_dense=ImageMetrics(math.nan, 0.9))
-    text = make_page(points=(first, unknown, *others)).read_text("utf-8")
-    rows = dict(re.findall(r'<tr data-key="([^"]*)">(.*?)</tr>', text, flags=re.DOTALL))
-    assert '<td data-value="inf">identical</td>' in rows["dense"]
-    assert rows[second.key].count('<td data-value="">–</td>') == 3
 
 
 def test_page_takes_no_more_bytes_than_it_may(sweep, tmp_path):
@@ -165,15 +97,6 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
     size = flight_path(tmp_path / "copy", "dense").stat().st_size
     monkeypatch.setattr(page, "FLIGHT_BYTES", size)
     assert names("0.1_coverage") == ["a tenth"] and names("dense") == ["dense"]
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"scenes": []}', b"\xff" * 9, b" " * 4_000_001])
-def test_what_is_no_scene_to_fly_through_is_left_out(sweep, tmp_path, content):
-    measured, folder = sweep
-    shutil.copytree(folder, tmp_path / "copy")
-    flight_path(tmp_path / "copy", "dense").write_bytes(content)
-    page = write_sweep_page(replace(measured, recommended="dense"), tmp_path / "copy", tmp_path / "page.html")
-    assert parts_of(page).data["flight"] is None
 
 
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
