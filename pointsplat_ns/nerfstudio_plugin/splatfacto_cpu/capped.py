@@ -34,7 +34,7 @@ class CappedStrategy(Strategy):
     """Number of Gaussians that is reached, and never exceeded."""
     first_step: int
     """There is no densification up to this step."""
-    grown_by: int
+    full_from: int
     """Step at which the number is reached."""
     last_step: int
     """There is no densification from this step on."""
@@ -78,7 +78,7 @@ class CappedStrategy(Strategy):
         dead = opacities <= self.least_opacity
         if dead.all():
             return
-        count = grown_number(num, self.most, (self.grown_by - 1 - step) // self.every)
+        count = next_count(num, self.most, (self.full_from - 1 - step) // self.every)
         places = torch.cat([dead.nonzero()[:, 0], torch.arange(num, count, device=dead.device)])
         sources = drawn(opacities.masked_fill(dead, 0.0), len(places))
         rows = torch.arange(count, device=dead.device)
@@ -154,7 +154,7 @@ def drawn(weights: Tensor, count: int) -> Tensor:
     return chosen.clamp(max=int(weights.nonzero()[-1]))  # where the product is rounded up to the last end
 
 
-def grown_number(num: int, most: int, later: int, least_factor: float = 1.05) -> int:
+def next_count(num: int, most: int, later: int, least_factor: float = 1.05) -> int:
     """Number of Gaussians after a densification of ``num``, if ``later`` more follow until ``most`` has to be reached:
     the same factor for each, and at least the paper's."""
     if num >= most or later <= 0:

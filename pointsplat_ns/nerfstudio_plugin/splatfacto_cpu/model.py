@@ -99,7 +99,7 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
             return CappedStrategy(
                 most=most,
                 first_step=self.warmup_length,
-                grown_by=self.stop_split_at,
+                full_from=self.stop_split_at,
                 last_step=self.stop_relocation_at,
                 every=self.refine_every,
                 noise=self.noise_lr,

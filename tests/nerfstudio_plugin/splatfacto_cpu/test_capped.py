@@ -11,7 +11,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
     CappedStrategy,
-    grown_number,
+    next_count,
     position_noise,
     replaced,
     shared_opacity,
@@ -72,11 +72,11 @@ def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
 
 
 def test_the_number_grows_by_5_percent_or_as_fast_as_needed_and_is_reached_exactly():
-    assert grown_number(1000, 5000, 100) == 1050
-    assert grown_number(990, 1000, 100) == grown_number(1000, 1000, 3) == grown_number(10, 1000, 0) == 1000
+    assert next_count(1000, 5000, 100) == 1050
+    assert next_count(990, 1000, 100) == next_count(1000, 1000, 3) == next_count(10, 1000, 0) == 1000
     number = 10
     for later in range(7, -1, -1):
-        before, number = number, grown_number(number, 1000, later)
+        before, number = number, next_count(number, 1000, later)
         assert 1.5 < number / before < 2.2, "the same factor each time, up to whole numbers"
     assert number == 1000
 
@@ -108,7 +108,7 @@ def test_the_picture_hardly_changes_where_gaussians_move_to_others():
         }
     )
     optimizers = {name: torch.optim.Adam([value], lr=0.0) for name, value in params.items()}
-    strategy = CappedStrategy(most=4, first_step=0, grown_by=10, last_step=100, every=5, noise=0.0)
+    strategy = CappedStrategy(most=4, first_step=0, full_from=10, last_step=100, every=5, noise=0.0)
     seen, nothing = ({"radii": torch.tensor([[[size, size]]])} for size in (3, 0))
     torch.manual_seed(SEED)
     for step, info in ((4, seen), (5, nothing)):
@@ -197,7 +197,7 @@ def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
     config.max_num_iterations = 3000
     strategy = fitted_schedules(config).pipeline.model.densification(10)
     assert isinstance(strategy, CappedStrategy) and strategy.every == 43
-    assert strategy.first_step < strategy.grown_by < strategy.last_step < 3000
+    assert strategy.first_step < strategy.full_from < strategy.last_step < 3000
     config.pipeline.model.max_gs_num = 0
     with pytest.raises(PointSplatError, match="max-gs-num 0: expected at least 1"):
         _ = config.pipeline.model.cap
