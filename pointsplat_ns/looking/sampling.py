@@ -79,7 +79,7 @@ class Sampler:
     """Samples views of a scene as :func:`sample_views` does. What all views have in common is found once.
 
     Args:
-        scene: N Gaussians.
+        scene: N Gaussians. A large one is thinned.
         resolution: width and height of the views, pixels.
         up: which way is up; by default it is estimated.
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
@@ -97,7 +97,8 @@ class Sampler:
     ):
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
-        self.scene, self.resolution, self.settings, self._up = scene.detach(), resolution, settings, up
+        self.scene, self._count = thinned(scene.detach(), settings.sampled_count), len(scene)
+        self.resolution, self.settings, self._up = resolution, settings, up
 
     @cached_property
     def photos(self) -> PhotoPlaces | None:
@@ -143,7 +144,7 @@ class Sampler:
         count = self.settings.blur_count
         fine = in_units(thinned(self.scene, count), *self.content)
         widths = log_widths(fine.scales).nan_to_num(-100.0).exp()
-        return fine, widths / math.sqrt(max(1, len(self.scene) // count))
+        return fine, widths / math.sqrt(max(1, self._count // count))
 
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, sharp: bool = True, about_photos: bool = True) -> Views:

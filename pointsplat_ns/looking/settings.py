@@ -210,8 +210,7 @@ class LookingSettings:
     """Elevation of the cameras around the content, degrees."""
 
     opening_candidates: int = 24
-    """Number of views from enclosed places, of those that show most surface, that compete. With 16, a bathroom opens on
-    a corner."""
+    """Number of views from enclosed places, of those that show most surface, that compete."""
 
     opening_inside: float = 1.1
     """A scene that is no room is first shown from within if a view from there shows more than this many times as many
@@ -301,17 +300,18 @@ class LookingSettings:
     """Smallest distance of a camera near photo places from surfaces, units; 0 turns the rule off. Photos may show a
     small part of the content from nearby."""
 
+    sampled_count: int = 250_000
+    """About the largest number of Gaussians in which views are looked for; of more, every second (third, ...) is."""
+
     blur_count: int = 40_000
-    """Largest number of Gaussians in the pictures that measure blur. 5,000 are too few: large ones then hide the
-    others."""
+    """Largest number of Gaussians in the pictures that measure blur; 5,000 are too few."""
 
     blur_side: int = 64
     """Longer side of the pictures that measure blur, pixels."""
 
     max_blur: float = 0.04
     """Largest blur of a view: median over pixels of the angle that Gaussians' standard deviations subtend, radians;
-    infinity turns the rule off. In the photos of six captures it is 0.009 to 0.026, in half of the views that are
-    sampled there without this rule 0.04 to 0.5."""
+    infinity turns the rule off. In photos of six captures it is 0.009 to 0.026."""
 
     coarse_blur: float = 2.0
     """The largest blur is at least this multiple of the angle that the median Gaussian subtends from half the content's

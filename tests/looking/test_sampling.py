@@ -7,7 +7,7 @@ import pytest
 import torch
 from upright_scenes import TURNS, room, tower, turned
 
-from making import photographed
+from making import box_room, photographed
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.poses import look_at
@@ -174,3 +174,10 @@ def test_views_near_photo_places_can_be_turned_off(off):
         without.viewmats, Sampler(scene, (64, 48), Up(up.double())).views(3, about_photos=False).viewmats
     )
     assert not torch.equal(without.viewmats, sample_views(scene, 3, 64, 48, up=up).viewmats)
+
+
+def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it():
+    scene = box_room(0, 3000)
+    few = Sampler(scene, (64, 48), settings=dataclasses.replace(LOOKING, sampled_count=700))
+    assert len(few.scene) == 750 and len(few.views(3)) == 3
+    assert few.content[1] == pytest.approx(Sampler(scene).content[1], rel=0.05)
