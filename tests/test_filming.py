@@ -122,3 +122,13 @@ def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     assert Image.open(tmp_path / "given.png").size == (1000, 50)
     ps.render_path(scene, tmp_path / "narrow.png", path=ps.sample_views(scene, 1, 1001, 50), width=80)
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
+
+
+def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(files, tmp_path, capsys):
+    (tmp_path / "ball.ply").write_bytes((files / "ball.ply").read_bytes())
+    words = ["render", str(tmp_path / "ball.ply"), "--width", "33", "--height", "25", "--fps", "2", "--seconds", "1"]
+    main(words)
+    assert (tmp_path / "ball.mp4").stat().st_size > 500
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "ball.mp4: exists already" in capsys.readouterr().err

@@ -149,3 +149,9 @@ def test_a_shape_that_does_not_fit_is_named(change, message):
     given = {name: getattr(make(), name) for name in ("viewmats", "Ks", "background")}
     with pytest.raises(DataError, match=message):
         Views(**{**given, **change}, width=64, height=48)
+
+
+@pytest.mark.parametrize("size", [(0, 48), (64, 0)])
+def test_an_image_without_a_pixel_is_refused(size):
+    with pytest.raises(DataError, match=f"{size[0]} x {size[1]} pixels; expected at least 1 x 1"):
+        make(width=size[0], height=size[1])

@@ -60,21 +60,6 @@ def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(path)
     assert (down @ up).max() < -0.3  # and up is up: no view looks down or up by more than about 70 degrees
 
 
-@pytest.mark.parametrize("width", [320, 960, 1920])
-def test_a_view_has_what_it_looks_at_in_its_middle_and_the_field_across_its_width(folder, width):
-    views = camera_paths.views_of(write_path(folder), width)
-    assert (views.width, views.height) == (width, width * 9 // 16)
-    assert views.background.tolist() == [0, 0, 0]
-    distances = [math.dist(view["eye"], view["at"]) for view in PATH["views"]]
-    assert views.near_plane == pytest.approx(1e-3 * sorted(distances)[1])
-    for view, look, distance in zip(views, PATH["views"], distances, strict=True):
-        rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
-        at = rotation @ torch.tensor(look["at"], dtype=torch.float64) + translation
-        assert torch.allclose(at, torch.tensor([0, 0, distance], dtype=torch.float64), atol=1e-12)
-        edge = view.K @ torch.tensor([math.tan(math.radians(30)), 0, 1], dtype=torch.float64)
-        assert edge[:2].tolist() == pytest.approx([width, view.height / 2])
-
-
 def ball(colour: float = 1.0) -> Gaussians:
     """One opaque Gaussian of a grey, at the origin."""
     return Gaussians(

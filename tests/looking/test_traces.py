@@ -77,16 +77,6 @@ def test_scenes_without_evidence_have_no_photo_places(scene):
     assert photo_places(scene) is None
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_photo_places_by_sh_move_and_scale_with_the_scene(scale):
-    scene = Gaussians(*(value.double() for value in photographed().tensors()))
-    places, shares = photo_places(scene)
-    moved = scene.replace(means=scale * (scene.means + 100))
-    other, as_large = photo_places(moved)
-    torch.testing.assert_close(other / scale - 100, places, atol=1e-5, rtol=0)
-    torch.testing.assert_close(as_large, shares, atol=1e-4, rtol=0)
-
-
 @pytest.mark.parametrize("factor", [1e-30, 1e3, 1e38])
 def test_photo_places_are_found_from_sh_of_any_length_but_zero(factor):
     scene = photographed()
@@ -253,3 +243,11 @@ def test_sampled_poses_near_photo_places_say_so(monkeypatch):
     assert len(source.views(3)) and len(source.compared())
     assert source.origin.startswith("poses sampled in free space, half of them where photos were taken, up is ")
     assert len(asked) == 1  # the search for photo places takes seconds
+
+
+def test_given_views_go_before_all_others(scene, trained_walls):
+    given = sample_views(scene, 3, 48, 36)
+    source = ViewSource(scene, given, run_of(trained_walls, "wall-a"), data_is_gone)
+    assert source.views(9) is given and source.origin == "given views"
+    with pytest.raises(DataError, match="the views given are empty"):
+        ViewSource(scene, given[:0]).views(3)

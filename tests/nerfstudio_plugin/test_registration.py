@@ -94,29 +94,6 @@ def test_a_specification_that_fails_to_load_becomes_one_line():
     assert load_specification("some-method", dict) == {}
 
 
-@pytest.mark.parametrize(
-    ("dataparser", "kind"),
-    [
-        ([], "NerfstudioDataParserConfig"),
-        (["nerfstudio-data"], "NerfstudioDataParserConfig"),
-        (["scannetpp-data"], "ScanNetppDataParserConfig"),
-        (["scannetpp-seeded", "--skip-bad", "False"], "SeededScanNetppDataParserConfig"),
-        (["replica-data", "--eval-every", "5"], "ReplicaDataParserConfig"),
-    ],
-)
-def test_ns_train_parses_every_dataparser(dataparser, kind, tmp_path):
-    import tyro
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-    arguments = ["splatfacto-cpu", "--data", str(tmp_path), "--max-num-iterations", "12", *dataparser]
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
-    parser = config.pipeline.datamanager.dataparser
-    assert type(parser).__name__ == kind
-    assert config.data == tmp_path and config.max_num_iterations == 12
-    if kind == "NerfstudioDataParserConfig":
-        assert parser.load_3D_points, "Splatfacto starts from the points that come with the data"
-
-
 def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     # Run without nerfstudio, whose import takes seconds; method_configs.methods installs this same hook.
     code = (

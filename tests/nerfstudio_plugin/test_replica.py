@@ -1,6 +1,7 @@
 """The ``replica-data`` dataparser and the Replica layout on disk: what is read, and what each fault says."""
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -223,3 +224,13 @@ def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     xyz, _ = fuse_depth(scene, 1000, scene.params.principal_point())
     # Lost: the columns on both sides of the step, the unknown pixel and its two other neighbours.
     assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
+
+
+@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 -1e300 0 1 0 0 0 0 1 0 0 0 0 1",
+                                  "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])  # fmt: skip
+def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(scene, caplog, lost):
+    edit_line(scene, 2, lost)
+    with caplog.at_level(logging.WARNING):
+        loaded = load_replica(scene)
+    assert loaded.numbers == (0, 2, 3) and np.isfinite(loaded.poses.astype(np.float32)).all()
+    assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text

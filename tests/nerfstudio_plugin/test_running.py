@@ -11,10 +11,8 @@ import pointsplat_ns as ps
 from making import write_run
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
-from pointsplat_ns.nerfstudio_plugin.running import (
-    has_finished,
-    remove_interrupted,
-)
+from pointsplat_ns.nerfstudio_plugin.measure_tables import paper_dataset
+from pointsplat_ns.nerfstudio_plugin.running import has_finished, remove_interrupted
 from pointsplat_ns.tables import outputs
 from pointsplat_ns.tradeoff import machine
 
@@ -66,3 +64,35 @@ def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames
 
 def run(data: Path, parser: str) -> SimpleNamespace:
     return SimpleNamespace(data=data, dataparser_class=parser)
+
+
+def test_only_an_interrupted_training_is_removed(tmp_path):
+    done, stopped = tmp_path / "done", tmp_path / "stopped"
+    write_run(done, 30, 30)
+    write_run(stopped, 12, 30)
+    remove_interrupted(stopped)
+    assert not stopped.exists()
+    with pytest.raises(SceneError, match="holds a finished training"):
+        remove_interrupted(done)
+    assert len(files(done)) == 2
+
+
+def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path):
+    assert paper_dataset(replica(tmp_path, "office2")) == "Replica"
+    assert paper_dataset(replica(tmp_path, "kitchen", frames=3)) == ""
+    assert paper_dataset(replica(tmp_path / "few", "office2", frames=3)) == ""
+    # The rooms that this package makes are of the same layout and may be called the same.
+    assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""
+    assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
+
+
+def test_scannetpp_is_known_by_the_names_of_its_scenes(tmp_path):
+    for name in ("0a5c013435", "fox"):
+        (tmp_path / name / "dslr").mkdir(parents=True)
+    assert paper_dataset(run(tmp_path / "0a5c013435", SCANNETPP)) == "ScanNet++"
+    assert paper_dataset(run(tmp_path / "fox", SCANNETPP)) == ""
+    assert paper_dataset(run(tmp_path / "0a5c013436", SCANNETPP)) == ""
+    assert paper_dataset(run(tmp_path / "0a5c013435", "nerfstudio.NerfstudioDataParserConfig")) == ""
+
+
+SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParserConfig"

@@ -139,16 +139,6 @@ def test_all_targets_hold_at_once():
     assert targets.missed(point) == []
 
 
-def test_a_slower_scene_of_a_smaller_file_does_not_hide_one_that_is_fast_enough():
-    """Without SH bands files are smaller, but it takes more Gaussians to reach the quality."""
-    trade = Trade(gains={}, cuts={0: 31.0, 1: 32.0, 2: 33.0})
-    smallest = search(trade, Targets(db=30.0)).run().point
-    assert smallest.sh_degree < 3
-    limit = smallest.frame_ms - 1
-    fast = search(trade, Targets(db=30.0, ms=limit)).run().point
-    assert fast.frame_ms <= limit and fast.bytes > smallest.bytes
-
-
 @pytest.mark.parametrize(
     "targets, said",
     [(Targets(db=40.0, mb=0.5), "over --target-mb 0.5"), (Targets(db=40.0, ms=3.0), "over --target-ms 3")],

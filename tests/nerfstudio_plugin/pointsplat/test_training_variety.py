@@ -1,5 +1,7 @@
 """What makes a training vary (budgets, transforms, rates that fit), and pruned scenes kept on disk."""
 
+import math
+
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
@@ -7,8 +9,9 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, move_zero_layers, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey, read_pruned, stored_path, write_pruned
 from pointsplat_ns.pruning import PruneSettings
@@ -107,3 +110,15 @@ def test_pixel_losses_at_extremes(name, scale):
     assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5, abs=1e-9)
     assert found.grad.isfinite().all()
     assert torch.allclose(found.grad.double(), exact.grad, rtol=1e-4, atol=1e-7)
+
+
+def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls, tmp_path):
+    config = small_config(trained_walls, tmp_path, 1)
+    config.rate_factor = 3.0
+    trainer = config.setup(local_rank=0, world_size=1)
+    for name, group in trainer.config.optimizers.items():
+        assert group["optimizer"].lr == pytest.approx(3 * REFINER_RATES[name])
+    assert config.optimizers["encoder"]["optimizer"].lr == REFINER_RATES["encoder"], "the config given is left as it is"
+    for config.rate_factor in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(PointSplatError, match="--rate-factor"):
+            config.setup(local_rank=0, world_size=1)
