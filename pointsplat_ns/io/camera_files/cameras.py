@@ -20,7 +20,7 @@ from pointsplat_ns.views import Views
 
 @dataclass(frozen=True)
 class CameraLimits:
-    """CameraLimits of files of cameras."""
+    """Limits of files of cameras."""
 
     file_bytes: int = 64_000_000
     """Maximum size of JSON: 100,000 frames have about as much."""
