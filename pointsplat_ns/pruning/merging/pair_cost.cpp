@@ -17,7 +17,7 @@ struct Planes {
 };
 
 struct Limits {
-    double max_coordinate, max_width, min_width, roundness, min_divisor;
+    double max_coordinate, max_width, min_width, roundness, min_divisor, max_growth;
 };
 
 struct Contrasts {
@@ -153,6 +153,7 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
     const float min_variance = c.limits.min_width * c.limits.min_width;
     const float assumed = s.channels * s.min_contrast * s.min_contrast, min_cover = s.min_cover;
     const float hole = s.channels * s.background_contrast * s.background_contrast;
+    const float max_growth = c.limits.max_growth;
     const float max_opacity = s.max_opacity, exponent = s.growth_exponent, max_ratio = s.max_growth_ratio;
     const int neighbours = static_cast<int>(c.neighbours), axes = static_cast<int>(c.axes);
     const int blocks = (neighbours + LANES - 1) / LANES;
@@ -227,7 +228,9 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
                     const Lane gij = 2.0f * both, gik = 2.0f * me.alpha * alpha * oik, gjk = 2.0f * other.alpha * alpha * ojk;
                     const Lane colour = jj * gjj + ii * gii + kk * gkk + ij * gij - ik * gik - jk * gjk;
                     const Lane shape = gjj + gii + gkk + gij - gik - gjk;
-                    total[b] += larger(colour, ZERO) * counted + larger(shape, ZERO) * through;
+                    const Lane growth = smaller(area / (first.area + second.area), ZERO + max_growth);
+                    const Lane change = larger(colour, ZERO) * counted + larger(shape, ZERO) * through;
+                    total[b] += growth * growth * change;
                 }
             }
             for (int b = 0; b < blocks; ++b)

@@ -40,6 +40,8 @@ class ProjectionLimits:
     thin projections from lines: widths are at least 0.3 % of lengths."""
     min_divisor: float = 1e-30
     """Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
+    max_growth: float = 100.0
+    """Largest growth of the area by a replacement: points grow without bounds."""
 
 
 PROJECTION_LIMITS = ProjectionLimits()

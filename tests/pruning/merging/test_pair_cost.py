@@ -112,7 +112,8 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     shape = parts.sum(0).square().sum() * pixel
     blend = float(change.square().sum() * pixel + assumed * shape)
     through = 3 * MERGING.background_contrast**2 * math.exp(-4 * float(cover))
-    want = blend / max(float(cover), 0.5) ** 2 + through * float(shape)
+    area_growth = float(torch.linalg.det(merged_cov).sqrt() / areas.sum())
+    want = area_growth**2 * (blend / max(float(cover), 0.5) ** 2 + through * float(shape))
     assert got == pytest.approx(want, rel=2e-3)  # float32, where six terms nearly cancel
 
 
@@ -168,7 +169,8 @@ def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
     exact = pair_costs(state, near, dtype=torch.float64)
     scale = exact.amax(1, keepdim=True)
     kernels, torchs = (((pair_costs(state, near, compiled=on) - exact) / scale).abs() for on in (True, False))
-    for share, times in ((0.5, 2), (0.99, 2), (1.0, 5)):  # the largest error of a few thousand varies more
+    # Torch projects in float64; the square of the growth makes most of that in the largest errors.
+    for share, times in ((0.5, 2), (0.99, 4), (1.0, 5)):
         assert float(kernels.quantile(share)) < times * float(torchs.quantile(share))
 
 
@@ -194,7 +196,7 @@ def test_float32_costs_rank_pairs_as_float64_does():
     i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
     for direction in range(len(DIRECTIONS)):
         a, b = (costs_along(state, direction, i, j, dtype) for dtype in (torch.float64, torch.float32))
-        assert float((a - b).abs().max()) < 1e-3 * float(a.max())
+        assert float((a - b).abs().max()) < 2e-3 * float(a.max())  # 1e-3 of an area, squared
 
 
 def test_the_area_is_the_root_mean_square_over_directions():
