@@ -8,11 +8,12 @@ import torch
 from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
+from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import Kernels
 
 MODULES = (
-    *(blending, projection, colors, tiles, structural_similarity),
+    *(blending, projection, colors, tiles, pictures, structural_similarity),
     *(neighbours, pair_cost, matching, replacement, regrouping),
 )
 
@@ -32,8 +33,11 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
             id="a projected gradient",
         ),
         pytest.param(
-            projection, "(x - half_x <= camera.width - 0.5f)", "(x <= camera.width - 0.5f)", 1, id="who is seen"
+            projection, "if (!flat.drawn[lane]) continue;", "if (lane == 3) continue;", 1, id="who is seen"
         ),
+        pytest.param(pictures, "r * v + sign", "r * v - sign", 1, id="which tiles of a picture"),
+        pytest.param(pictures, "color < 0.0f ? 0.0f : color;", "color;", 1, id="a picture's colour"),
+        pytest.param(pictures, "static_cast<int64_t>(bits) << 32", "int64_t(0)", 1, id="what is in front"),
         pytest.param(colors, "+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -", 1, id="a colour's gradient"),
         pytest.param(colors, "grad_rest + task.ids[row] * task.rest_row", "grad_rest", 1, id="a part's gradient"),
         pytest.param(tiles, "level - dy * dy * inverse_yy", "level - dy * inverse_yy", 1, id="which tiles"),

@@ -98,6 +98,30 @@ def project_scene(scene: Gaussians, view: View) -> Projected:
     )  # fmt: skip
 
 
+def camera_of(
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    antialiased: bool,
+) -> tuple[Tensor, Tensor, Lens]:
+    """Rotation (3, 3) and centre (3,) of a camera, float64, and its intrinsics. Arguments and errors are those of
+    :func:`project`."""
+    # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
+    centre = camera_centre(viewmat)
+    (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx == 0 or fy == 0:
+        raise ValueError(f"K has fx {fx}, fy {fy}, cx {cx}, cy {cy}; expected finite numbers and focal lengths not 0")
+    if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
+        raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
+    lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
+    return viewmat[:3, :3].double(), centre, lens
+
+
 def project(
     means: Tensor,  # [N, 3] world
     quats: Tensor,  # [N, 4] wxyz, any length
@@ -132,14 +156,7 @@ def project(
     Raises:
         ValueError: if a focal length is zero, or the camera is not finite, has skew or is not a rigid motion.
     """
-    # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
-    centre = camera_centre(viewmat)
-    (fx, skew, cx), (below, fy, cy), last = K.tolist()
-    if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx == 0 or fy == 0:
-        raise ValueError(f"K has fx {fx}, fy {fy}, cx {cx}, cy {cy}; expected finite numbers and focal lengths not 0")
-    if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
-        raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
-    lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
+    view, centre, lens = camera_of(viewmat, K, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
     suited = compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities)
     function = compiled_projection.CompiledProject if suited else Project
-    return Projected(*function.apply(means, quats, scales, opacities, viewmat[:3, :3].double(), centre, lens))
+    return Projected(*function.apply(means, quats, scales, opacities, view, centre, lens))

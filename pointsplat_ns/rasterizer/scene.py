@@ -9,15 +9,16 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import binning
-from pointsplat_ns.rasterizer.compiled import blending as kernels
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN, Quality
+from pointsplat_ns.rasterizer import pictures
+from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET
-from pointsplat_ns.rasterizer.projection import project_scene
+from pointsplat_ns.rasterizer.projection import camera_of
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
-from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
+
+MOST_PAIRS = MEMORY_BUDGET // 16
+"""Largest number of pairs of Gaussian and tile in one pass, of 12 bytes each; pictures of more are drawn by regions."""
 
 
 def render(
@@ -66,9 +67,25 @@ def render_with_alpha(
     """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
     :func:`render`."""
     with suitable_threads(scene.device):
+        if backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
+            drawn = pictures.picture(scene, _camera(scene, view), QUALITIES[quality], MOST_PAIRS)
+            if drawn is not None:
+                return _over(*drawn, view), drawn[1]
         colors = scene.features_dc, scene.features_rest
         image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
-        return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1), alpha
+        return _over(image, alpha, view), alpha
+
+
+def _over(image: Tensor, alpha: Tensor, view: View) -> Tensor:
+    """A picture (H, W, 3) over black with its alpha (H, W, 1) over the view's background, in [0, 1]."""
+    return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1)
+
+
+def _camera(scene: Gaussians, view: View) -> pictures.Camera:
+    return camera_of(
+        view.viewmat, view.K.to(scene.means), view.width, view.height, view.near_plane, math.inf, 0.0, view.eps2d,
+        view.rasterize_mode == "antialiased",
+    )  # fmt: skip
 
 
 def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
@@ -109,29 +126,15 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     :func:`pointsplat_ns.rasterization`."""
     scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
     with suitable_threads(scene.device):
-        if kernels.KERNELS.usable_for(compiled, scene.means):
-            return _weighed(scene, view)
+        if pictures.can_draw(scene, compiled):
+            weights = pictures.weights(scene, _camera(scene, view), Quality(), MOST_PAIRS)
+            if weights is not None:
+                return weights
         with torch.enable_grad():
             colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
             image, _ = _rasterized(scene, view, colors, compiled=compiled)
             (pixels,) = torch.autograd.grad(image.sum(), colors)
     return pixels[:, 0]
-
-
-@torch.no_grad()
-def _weighed(scene: Gaussians, view: View) -> Tensor:
-    """:func:`pixels_of` in one pass, without a picture."""
-    seen = project_scene(scene, view)
-    shape = seen.means2d, seen.cov2d, seen.det, seen.opacities
-    footprints = Footprints(
-        *shape, seen.depth_keys, torch.zeros_like(seen.ids), 1, view.width, view.height, ALPHA_MIN,
-        binning.engine_of(None, *shape),
-    )  # fmt: skip
-    inputs = kernels.inputs_of(*shape, seen.means2d[:, :0], Quality())
-    weights = torch.zeros_like(seen.opacities)
-    for region in footprints.regions(MEMORY_BUDGET // 32):  # bytes of a pair of tile and Gaussian
-        weights += kernels.weigh_region(footprints, footprints.tiles(region), inputs)
-    return scene.means.new_zeros(len(scene)).index_copy_(0, seen.ids, weights)
 
 
 def _alphas(scene: Gaussians) -> Tensor:

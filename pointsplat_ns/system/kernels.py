@@ -1,9 +1,9 @@
 """Functions of a C++ file of this package: built by the machine's compiler and tried when first used, and called on
 several threads.
 
-Structs and functions are read from the file itself, so that nothing is declared twice. A file shares what stands
-between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers, arrays, pointers and earlier
-structs.
+Structs and functions are read from the file and the headers beside it that it includes, so that nothing is declared
+twice. Files share what is between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers,
+arrays, pointers and earlier structs.
 """
 
 from __future__ import annotations
@@ -245,13 +245,20 @@ class Kernels:
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
         """The structs that the functions take, by name."""
-        return structs_of(self.source.read_text("utf-8"))
+        return structs_of(self._text)
+
+    @functools.cached_property
+    def _text(self) -> str:
+        """The text of the file, after those of the headers beside it that it includes."""
+        text = self.source.read_text("utf-8")
+        headers = [self.source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
+        return "".join([*(header.read_text("utf-8") for header in headers if header.is_file()), text])
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
         """The functions, built if need be. Raises NativeCodeError if this machine cannot build them."""
         library = load_native(self.source)
-        for name, (result, parameters) in functions_of(self.source.read_text("utf-8"), self.structs).items():
+        for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, parameters
         return library

@@ -135,8 +135,10 @@ def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype, compi
         torch.testing.assert_close(pixels, wanted, rtol=tolerance, atol=tolerance)
 
 
-def test_pixels_are_the_same_on_any_threads_and_to_rounding_in_several_regions(room, views, monkeypatch):
+def test_pixels_are_the_same_on_any_threads_and_to_rounding_where_pairs_are_too_many_for_one_pass(
+    room, views, monkeypatch
+):
     whole = pixels_of(room, views[0])
     assert_same_on_any_threads(lambda: [pixels_of(room, view) for view in views])
-    monkeypatch.setattr(scene_module, "MEMORY_BUDGET", 32 * 3000)
+    monkeypatch.setattr(scene_module, "MOST_PAIRS", 3000)
     torch.testing.assert_close(pixels_of(room, views[0]), whole, rtol=1e-5, atol=1e-6)  # float32, in another order

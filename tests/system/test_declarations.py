@@ -12,6 +12,7 @@ import pointsplat_ns
 from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
+from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import functions_of, structs_of
 
@@ -43,18 +44,18 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 
 }  // extern "C"
 """
-MODULES = (blending, colors, projection, tiles, structural_similarity)
+MODULES = (blending, colors, pictures, projection, tiles, structural_similarity)
 MERGING = (neighbours, matching, pair_cost, regrouping, replacement)
-SOURCES = [module.KERNELS.source for module in MODULES + MERGING]
+KERNELS = [module.KERNELS for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
-@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
-def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
-    structs = structs_of(source.read_text("utf-8"))
+@pytest.mark.parametrize("kernels", KERNELS, ids=lambda kernels: kernels.source.stem)
+def test_structs_are_laid_out_as_the_compiler_lays_them_out(kernels, tmp_path):
+    structs = kernels.structs
     assert structs
-    lines = ["#include <cstddef>", f'#include "{source}"']
+    lines = ["#include <cstddef>", f'#include "{kernels.source}"']
     for name, struct in structs.items():
         lines.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(struct)});")
         lines += [

@@ -18,7 +18,7 @@ from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.alpha import CLAMPED
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.rasterizer.tiles import Footprints, TileList
+from pointsplat_ns.rasterizer.tiles import Footprints, Region, TileList
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 
 
@@ -72,15 +72,30 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     return grads
 
 
-def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor, final: Tensor) -> Struct:
-    region, quality = tiles.region, inputs.quality
+def task_of(
+    size: tuple[int, int], region: Region, gaussians: Tensor, offsets: Tensor, inputs: KernelInputs, chunks: Tensor
+) -> Struct:
+    """The task of drawing a region of images of a size (width and height, pixels), without its output.
+
+    Args:
+        size, region: of the images.
+        gaussians: (P,) int64, rows of the inputs' table, by tile and front to back.
+        offsets: (tiles + 1,) int64, where those of each tile start.
+        inputs: the Gaussians.
+        chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
+    """
+    quality = inputs.quality
     return KERNELS.structs["Task"](
-        table=inputs.table, gaussians=tiles.gaussians, offsets=tiles.offsets, chunks=chunks,
-        tiles=tiles.offsets.numel() - 1, rows=region.rows, columns=region.columns, top=region.top, left=region.left,
-        width=footprints.width, height=footprints.height, channels=inputs.channels,
-        log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min, alpha_max=ALPHA_MAX,
-        clamped_from=CLAMPED, transmittance_min=quality.transmittance_min, final_=final,
+        table=inputs.table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
+        rows=region.rows, columns=region.columns, top=region.top, left=region.left, width=size[0], height=size[1],
+        channels=inputs.channels, log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min,
+        alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=quality.transmittance_min,
     )  # fmt: skip
+
+
+def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor) -> Struct:
+    size = footprints.width, footprints.height
+    return task_of(size, tiles.region, tiles.gaussians, tiles.offsets, inputs, chunks)
 
 
 def blend_region(
@@ -93,20 +108,20 @@ def blend_region(
     torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
     before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
     blended = torch.empty_like(tiles.offsets[1:])
-    task = _task(footprints, tiles, inputs, chunks, final)
-    task.fill(image=image, blended=blended, before=before if keep_tape and len(before) else None)
+    task = _task(footprints, tiles, inputs, chunks)
+    task.fill(image=image, final_=final, blended=blended, before=before if keep_tape and len(before) else None)
     on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
 
 
-def weigh_region(footprints: Footprints, tiles: TileList, inputs: KernelInputs) -> Tensor:
-    """Blending weight of each Gaussian, summed over the pixels of a region, (M,); ``inputs`` have no channels."""
-    sums = inputs.table.new_empty(tiles.gaussians.numel())
-    task = _task(footprints, tiles, inputs, tiles.offsets, sums)
-    task.fill(final_=None, chunks=None, sums=sums)
+def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
+    """Blending weight of each of ``count`` Gaussians, summed over pixels, (count,). The table of the task is without
+    colours; ``pairs`` (P,) are rows of it."""
+    sums = torch.empty(pairs.numel())
+    task.fill(sums=sums)
     on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
     # one thread, in the order of the tiles
-    return sums.new_zeros(len(tiles.order)).index_add_(0, tiles.gaussians, sums)
+    return sums.new_zeros(count).index_add_(0, pairs, sums)
 
 
 def differentiate_region(
@@ -124,9 +139,9 @@ def differentiate_region(
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
     columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
-    task = _task(footprints, tiles, inputs, tape.chunks, final)
+    task = _task(footprints, tiles, inputs, tape.chunks)
     task.fill(
-        before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
+        final_=final, before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
         grad_final=grad_final.contiguous(), sums=sums, absolute=int(absgrad),
     )  # fmt: skip
     on_threads(pairs >= SEVERAL, library.pointsplat_differentiate, task)
@@ -167,7 +182,8 @@ def _as_torch() -> bool:
         drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
     torchs, ours = drawn
     torchs += (torchs[2][:, MOMENTS],)
-    ours += (weigh_region(footprints, tiles, inputs_of(means2d, cov2d, det, opacities, colors[:, :0], Quality())),)
+    inputs = inputs_of(means2d, cov2d, det, opacities, colors[:, :0], Quality())
+    ours += (weigh(_task(footprints, tiles, inputs, tiles.offsets), tiles.gaussians, count),)
     return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
 
 

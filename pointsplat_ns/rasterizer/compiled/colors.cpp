@@ -4,7 +4,7 @@
 // torch, says where the formulas are from, and has the names that are used here. Threads take ranges of Gaussians, and
 // nothing is summed across Gaussians, so that the number of threads changes nothing.
 
-#include "lanes.h"
+#include "harmonics.h"
 
 extern "C" {
 
@@ -25,30 +25,8 @@ struct Colors {
 
 namespace {
 
-constexpr float C0 = 0.28209479177387814f, C1 = 0.4886025119029199f;
-constexpr float C2[3] = {1.0925484305920792f, 0.31539156525252005f, 0.5462742152960396f};
-constexpr float C3[5] = {0.5900435899266435f, 2.890611442640554f, 0.4570457994644658f, 0.3731763325901154f,
-                         1.445305721320277f};
-
 inline const float* coefficient(const Colors& task, int64_t row, int k) {
     return k ? task.rest + task.ids[row] * task.rest_row + 3 * (k - 1) : task.first + task.ids[row] * task.first_row;
-}
-
-template <int DEGREE>
-void basis_of(const Lane (&unit)[3], Lane* out) {
-    const Lane x = unit[0], y = unit[1], z = unit[2], xx = x * x, yy = y * y, zz = z * z, xy = x * y;
-    out[0] = ZERO + C0;
-    if (DEGREE >= 1) out[1] = -C1 * y, out[2] = C1 * z, out[3] = -C1 * x;
-    if (DEGREE >= 2) {
-        out[4] = C2[0] * xy, out[5] = -C2[0] * (y * z), out[6] = C2[1] * (2.0f * zz - xx - yy);
-        out[7] = -C2[0] * (x * z), out[8] = C2[2] * (xx - yy);
-    }
-    if (DEGREE >= 3) {
-        const Lane around = 4.0f * zz - xx - yy;
-        out[9] = -C3[0] * y * (3.0f * xx - yy), out[10] = C3[1] * xy * z, out[11] = -C3[2] * y * around;
-        out[12] = C3[3] * z * (2.0f * zz - 3.0f * xx - 3.0f * yy), out[13] = -C3[2] * x * around;
-        out[14] = C3[4] * z * (xx - yy), out[15] = -C3[0] * x * (xx - 3.0f * yy);
-    }
 }
 
 // Gradient by the unit direction, from the gradients of the basis.

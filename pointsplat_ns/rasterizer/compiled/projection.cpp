@@ -4,25 +4,9 @@
 // explains the formulas, and has the names that are used here. Threads take ranges of Gaussians of fixed size, and nothing
 // is summed across ranges, so that the number of threads changes nothing.
 
-#include "lanes.h"
+#include "camera.h"
 
 extern "C" {
-
-// A camera: ewa.Lens, and numbers derived from it.
-struct Camera {
-    double view[3][3], centre[3];
-    float near_view[3][3];  // view in float32
-    float fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d;
-    float alpha_min, least_ratio;        // the square of the least compensation
-    float steepness, longest;            // bound of |J| z, pixels; of a standard deviation / z
-    float low_x, high_x, low_y, high_y;  // bounds of x / z and y / z in the Jacobian
-    int64_t antialiased;
-};
-
-struct Scene {
-    const float *means, *quats, *scales, *opacities;  // [N, 3], [N, 4], [N, 3], [N]
-    int64_t count;
-};
 
 // A Gaussian that is drawn.
 struct Seen {
@@ -56,117 +40,18 @@ struct ProjectionGradient {
 
 }  // extern "C"
 namespace {
-constexpr float LARGEST = std::numeric_limits<float>::max();
-
-struct Position {
-    Wide direction[3], point[3];  // from the camera's centre, along the axes of the world and of the camera
-    Lane z, rz, slope_x, slope_y;
-
-    Position(const Camera& camera, const Lanes& lanes, const float* means) {
-        Lane mean[3];
-        lanes.load(means, mean);
-        for (int i = 0; i < 3; ++i) direction[i] = __builtin_convertvector(mean[i], Wide) - camera.centre[i];
-        for (int i = 0; i < 3; ++i) {
-            const double* row = camera.view[i];
-            point[i] = row[0] * direction[0] + row[1] * direction[1] + row[2] * direction[2];
-        }
-        z = narrow(point[2]);
-        rz = 1.0f / z;
-        slope_x = narrow(point[0]) * rz, slope_y = narrow(point[1]) * rz;
-    }
-};
-
-// The projected covariance and its intermediate values.
-struct Shape {
-    Lane tx, ty, unit[4], inverse_length, std[3], rotation[3][3];
-    Lane a[3], b[3], turned_a[3], turned_b[3], p1[3], p2[3], normal[3];
-    Lane xx, xy, yy, det0, blur, det, ratio;  // xx and yy without eps2d
-
-    Shape(const Camera& camera, const Position& at, const Lanes& lanes, const Scene& scene) {
-        tx = clamp(at.slope_x, camera.low_x, camera.high_x), ty = clamp(at.slope_y, camera.low_y, camera.high_y);
-        lanes.load(scene.quats, unit);
-        lanes.load(scene.scales, std);
-        inverse_length = normalise(unit);
-        for (Lane& value : std) value = smaller(value, at.z * camera.longest);
-        rotate();
-        const auto& view = camera.near_view;
-        for (int i = 0; i < 3; ++i) a[i] = view[0][i] - tx * view[2][i], b[i] = view[1][i] - ty * view[2][i];
-        for (int j = 0; j < 3; ++j) {
-            turned_a[j] = rotation[0][j] * a[0] + rotation[1][j] * a[1] + rotation[2][j] * a[2];
-            turned_b[j] = rotation[0][j] * b[0] + rotation[1][j] * b[1] + rotation[2][j] * b[2];
-            const Lane reach = std[j] * at.rz;
-            p1[j] = turned_a[j] * reach * camera.fx, p2[j] = turned_b[j] * reach * camera.fy;
-        }
-        cross(p1, p2, normal);
-        xx = dot(p1, p1), xy = dot(p1, p2), yy = dot(p2, p2);
-        det0 = dot(normal, normal);
-        blur = camera.eps2d * (xx + yy) + camera.eps2d * camera.eps2d;
-        det = det0 + blur;
-        ratio = det0 / det;
-    }
-
-    void rotate() {
-        const Lane w = unit[0], x = unit[1], y = unit[2], z = unit[3], x2 = 2.0f * x, y2 = 2.0f * y, z2 = 2.0f * z;
-        const Lane xx = x * x2, yy = y * y2, zz = z * z2, xy = x * y2, xz = x * z2, yz = y * z2;
-        const Lane wx = w * x2, wy = w * y2, wz = w * z2;
-        const Lane rows[3][3] = {{1.0f - (yy + zz), xy - wz, xz + wy},
-                                 {xy + wz, 1.0f - (xx + zz), yz - wx},
-                                 {xz - wy, yz + wx, 1.0f - (xx + yy)}};
-        std::memcpy(rotation, rows, sizeof(rows));
-    }
-
-    Lane compensation(const Camera& camera) const { return root(larger(ratio, ZERO + camera.least_ratio)); }
-};
-
-// Writes the rows of Gaussians that may touch the image, by a bound on their extent that needs no covariance. Returns
-// their number.
-int64_t find_candidates(const Projection& task, int64_t first, int64_t last, int64_t* out) {
-    const Camera& camera = task.camera;
-    int64_t* end = out;
-    for (int64_t at = first; at < last; at += LANES) {
-        const Lanes lanes(at, last - at);
-        const Position place(camera, lanes, task.scene.means);
-        Lane scale[3];
-        lanes.load(task.scene.scales, scale);
-        const Lane opacity = lanes.load(task.scene.opacities), std = larger(larger(scale[0], scale[1]), scale[2]);
-        // sqrt(2 ln 255) < 3.33 deviations
-        const Lane reach = std * place.rz * (3.4f * camera.steepness) + 3.4f;
-        const Lane x = place.slope_x * camera.fx + camera.cx, y = place.slope_y * camera.fy + camera.cy;
-        Mask seen = (place.z > camera.near_plane) & (place.z < camera.far_plane) & (opacity >= camera.alpha_min);
-        for (const Lane& value : scale) seen &= (value >= 0.0f) & (value < std::numeric_limits<float>::infinity());
-        seen &= (x > -reach) & (x < camera.width + reach) & (y > -reach) & (y < camera.height + reach);
-        for (int lane = 0; lane < lanes.count; ++lane) {
-            *end = at + lane;
-            end += seen[lane] & 1;
-        }
-    }
-    return end - out;
-}
 
 Seen* project_lanes(const Projection& task, const Lanes& lanes, Seen* out) {
     const Camera& camera = task.camera;
     const Position at(camera, lanes, task.scene.means);
-    const Shape shape(camera, at, lanes, task.scene);
-    const Lane xx = shape.xx + camera.eps2d, yy = shape.yy + camera.eps2d;
-    Lane alpha = lanes.load(task.scene.opacities);
-    if (camera.antialiased) alpha *= shape.compensation(camera);
-    const Lane x = at.slope_x * camera.fx + camera.cx, y = at.slope_y * camera.fy + camera.cy;
-    const Lane half = xx - yy, mid = 0.5f * (xx + yy);
-    const Lane radius = 3.0f * root(mid + root(0.25f * (half * half) + shape.xy * shape.xy));
-    // squared Mahalanobis distance of the 1/255 ellipse
-    const Lane level = 2.0f * each(alpha / camera.alpha_min, [](float value) { return std::log(value); });
-    const Lane half_x = root(larger(level * xx, ZERO)), half_y = root(larger(level * yy, ZERO));
-    Mask keep = (level > 0.0f) & is_finite(level) & is_finite(shape.det) & (shape.det > 0.0f);
-    keep &= (radius > camera.radius_clip) & is_finite(x) & is_finite(y);
-    keep &= (x + half_x >= 0.5f) & (x - half_x <= camera.width - 0.5f);
-    keep &= (y + half_y >= 0.5f) & (y - half_y <= camera.height - 0.5f);
-    const Lane columns[11] = {x, y, at.z, xx, shape.xy, yy, shape.det, alpha,
+    const Flat flat(camera, at, Shape(camera, at, lanes, task.scene), lanes.load(task.scene.opacities));
+    const Lane columns[11] = {flat.x, flat.y, at.z, flat.xx, flat.xy, flat.yy, flat.det, flat.alpha,
                               narrow(at.direction[0]), narrow(at.direction[1]), narrow(at.direction[2])};
     float values[11][LANES], radii[LANES];
     std::memcpy(values, columns, sizeof(columns));
-    std::memcpy(radii, &radius, sizeof(radius));
+    std::memcpy(radii, &flat.radius, sizeof(radii));
     for (int lane = 0; lane < lanes.count; ++lane) {
-        if (!keep[lane]) continue;
+        if (!flat.drawn[lane]) continue;
         const auto value = [&](int column) { return values[column][lane]; };
         *out++ = {at.point[2][lane], lanes.rows[lane], {value(0), value(1)}, value(2), {value(3), value(4), value(5)},
                   value(6), value(7), {value(8), value(9), value(10)},
@@ -285,7 +170,7 @@ int64_t pointsplat_seen() { return sizeof(Seen); }
 void pointsplat_project(const Projection* task, int64_t* next) {
     each_range(next, task->scene.count, [&](int64_t range, int64_t first, int64_t last) {
         int64_t candidates[RANGE];
-        const int64_t number = find_candidates(*task, first, last, candidates);
+        const int64_t number = find_candidates(task->camera, task->scene, first, last, candidates);
         Seen *begin = task->seen + first, *end = begin;
         for (int64_t at = 0; at < number; at += LANES) end = project_lanes(*task, Lanes(candidates + at, number - at), end);
         task->counts[range] = end - begin;

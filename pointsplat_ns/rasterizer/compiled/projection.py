@@ -18,11 +18,11 @@ from pointsplat_ns.rasterizer.ewa import Lens
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 
 
-def _camera(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
-    """The kernels' camera, from a rotation (3, 3) and a centre (3,), both float64."""
+def camera_struct(kernels: Kernels, view: Tensor, centre: Tensor, lens: Lens) -> Struct:
+    """The camera of kernels, from a rotation (3, 3) and a centre (3,), both float64."""
     rotation, steepness = tuple(view.flatten().tolist()), lens.steepness()
     (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
-    return KERNELS.structs["Camera"](
+    return kernels.structs["Camera"](
         view=rotation, centre=tuple(centre.tolist()), near_view=rotation,
         fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy, width=lens.width, height=lens.height,
         near_plane=lens.near, far_plane=lens.far, radius_clip=lens.radius_clip, eps2d=lens.eps2d,
@@ -32,8 +32,9 @@ def _camera(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
     )  # fmt: skip
 
 
-def _scene(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
-    return KERNELS.structs["Scene"](means=means, quats=quats, scales=scales, opacities=opacities, count=len(means))
+def scene_struct(kernels: Kernels, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
+    """The Gaussians of kernels, from contiguous tensors."""
+    return kernels.structs["Scene"](means=means, quats=quats, scales=scales, opacities=opacities, count=len(means))
 
 
 def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
@@ -42,7 +43,7 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
     tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
     ranges = -(-len(means) // library.pointsplat_range())
     counts = torch.empty(ranges, dtype=torch.int64)
-    on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, _scene(*tensors), counts)
+    on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, scene_struct(KERNELS, *tensors), counts)
     return int(counts.sum())
 
 
@@ -57,9 +58,9 @@ class CompiledProject(torch.autograd.Function):
         ranges = -(-count // library.pointsplat_range())
         counts, nearest = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.float64)
         seen = torch.empty(count, library.pointsplat_seen(), dtype=torch.uint8)
-        camera = _camera(view, centre, lens)
+        camera = camera_struct(KERNELS, view, centre, lens)
         task = KERNELS.structs["Projection"](
-            camera=camera, scene=_scene(*scene), seen=seen, counts=counts, nearest=nearest
+            camera=camera, scene=scene_struct(KERNELS, *scene), seen=seen, counts=counts, nearest=nearest
         )
         on_threads(count >= SEVERAL, library.pointsplat_project, task)
 
@@ -96,7 +97,7 @@ class CompiledProject(torch.autograd.Function):
         names = ("grad_means2d", "grad_depths", "grad_cov2d", "grad_det", "grad_opacities", "grad_directions")
         grads = {name: grad if grad is None else grad.contiguous() for name, grad in zip(names, given, strict=False)}
         task = KERNELS.structs["ProjectionGradient"](
-            camera=ctx.camera, scene=_scene(*scene), ids=ids, seen=len(ids), sums=sums, **grads, **out
+            camera=ctx.camera, scene=scene_struct(KERNELS, *scene), ids=ids, seen=len(ids), sums=sums, **grads, **out
         )
         on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
         grad_view = grad_centre = None

@@ -1,0 +1,154 @@
+"""Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
+over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
+
+For float32 on a CPU, where the machine has a C++ compiler. :func:`~pointsplat_ns.rasterization` gives the same pictures
+to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.rasterizer.blending import untiled
+from pointsplat_ns.rasterizer.compiled import blending
+from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
+from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
+from pointsplat_ns.rasterizer.constants import SLACK, TILE, Quality
+from pointsplat_ns.rasterizer.ewa import Lens
+from pointsplat_ns.rasterizer.projection import camera_of
+from pointsplat_ns.rasterizer.quadratics import PIXELS
+from pointsplat_ns.rasterizer.rendering import Colors, rasterization
+from pointsplat_ns.rasterizer.tiles import Region
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.threads import one_thread
+
+Camera = tuple[Tensor, Tensor, Lens]
+"""Rotation (3, 3) and centre (3,), float64, and intrinsics, as of
+:func:`~pointsplat_ns.rasterizer.projection.camera_of`."""
+
+
+def _placed(
+    scene: Gaussians, camera: Camera, colored: bool, quality: Quality, most_pairs: int
+) -> tuple[KernelInputs, Tensor, Tensor] | None:
+    """What is drawn on which tile.
+
+    Args:
+        scene: N Gaussians.
+        camera: where from.
+        colored: whether the table has colours.
+        quality: thresholds.
+        most_pairs: largest number of pairs of a Gaussian and a tile.
+
+    Returns:
+        The table of Gaussians, the Gaussians of each tile front to back (P,), and where those of each tile start
+        (tiles + 1,), both int64; None if the pairs are too many.
+    """
+    library, count = KERNELS.library, len(scene)
+    with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
+        tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
+    coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
+    channels, ranges, whole = (3 if colored else 0), -(-count // library.pointsplat_range()), _whole(camera[2])
+    table, depths = torch.empty(count, 6 + channels), torch.empty(count, dtype=torch.float64)
+    ids, boxes = torch.empty(count, dtype=torch.int32), torch.empty(count, 4, dtype=torch.int32)
+    counts, nearest = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.float64)
+    offsets = torch.zeros(whole.rows * whole.columns + 1, dtype=torch.int64)
+    inputs = KernelInputs(table, channels, quality)
+    task = KERNELS.structs["Placing"](
+        camera=camera_struct(KERNELS, *camera), scene=scene_struct(KERNELS, *tensors),
+        first=coefficients[0], rest=coefficients[1], rest_row=3 * coefficients[1].shape[1],
+        degree=scene.sh_degree if colored else -1,
+        rows=whole.rows, columns=whole.columns, log2_alpha_min=math.log2(quality.alpha_min), slack=SLACK,
+        most_color=torch.finfo(torch.float32).max ** 0.8, table=table, ids=ids, depths=depths, boxes=boxes,
+        counts=counts, nearest=nearest, offsets=offsets,
+    )  # fmt: skip
+    on_threads(count >= SEVERAL, library.pointsplat_place, task)
+    library.pointsplat_count(task)
+    offsets = torch.cumsum(offsets, 0)
+    total = int(offsets[-1])
+    if total > most_pairs:
+        return None
+    pairs = torch.empty(total, dtype=torch.int64)
+    task.fill(offsets=offsets, pairs=pairs)
+    if total:
+        library.pointsplat_list(task, offsets[:-1].clone())
+        on_threads(total >= SEVERAL, library.pointsplat_sort, task)
+    return inputs, pairs, offsets
+
+
+def _whole(lens: Lens) -> Region:
+    """All tiles of a picture."""
+    return Region(0, -(-lens.height // TILE), 0, -(-lens.width // TILE))
+
+
+def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> tuple[Tensor, Tensor] | None:
+    """Colours (H, W, 3) over black and alpha (H, W, 1); None if the pairs of Gaussians and tiles
+    are more than ``most_pairs``."""
+    found = _placed(scene, camera, True, quality, most_pairs)
+    if found is None:
+        return None
+    (inputs, pairs, offsets), lens = found, camera[2]
+    whole, count = _whole(lens), offsets.numel() - 1
+    image, final = torch.empty(count, 3, PIXELS), torch.empty(count, PIXELS)
+    task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
+    task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
+    on_threads(pairs.numel() >= SEVERAL, blending.KERNELS.library.pointsplat_blend, task)
+    colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
+    return colors, 1.0 - through
+
+
+def weights(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> Tensor | None:
+    """Blending weight of each Gaussian, summed over the pixels of a picture, (N,); None as for :func:`picture`."""
+    found = _placed(scene, camera, False, quality, most_pairs)
+    if found is None:
+        return None
+    (inputs, pairs, offsets), lens = found, camera[2]
+    task = blending.task_of((lens.width, lens.height), _whole(lens), pairs, offsets, inputs, offsets)
+    return blending.weigh(task, pairs, len(scene))
+
+
+def can_draw(scene: Gaussians, wanted: bool | None) -> bool:
+    """Whether the kernels draw a scene: float32, on a CPU, without gradients. ``wanted`` as ``compiled`` of
+    :func:`~pointsplat_ns.rasterization`."""
+    if torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors()):
+        return False
+    return KERNELS.usable_for(wanted, scene.means) and blending.KERNELS.usable_for(wanted, scene.means)
+
+
+def _as_torch() -> bool:
+    """Whether the kernels draw some Gaussians, and weigh them, as torch does."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    count, width, height = 90, 43, 38
+    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0])
+    sh = random(count, 3), 0.3 * random(count, 15, 3)
+    scene = Gaussians(means, 0.8 * random(count, 3) - 1.5, random(count, 4), random(count, 1), *sh)
+    viewmat, K = torch.eye(4), torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]])
+    camera = camera_of(viewmat, K, width, height, 0.01, math.inf, 0.0, 0.3, True)
+
+    def by_torch(colors: Colors, sh_degree: int | None) -> tuple[Tensor, Tensor]:
+        image, alpha, _ = rasterization(
+            scene.means, scene.quats, scene.stds, scene.alphas, colors, viewmat[None], K[None], width, height,
+            sh_degree=sh_degree, rasterize_mode="antialiased", compiled=False,
+        )  # fmt: skip
+        return image[0], alpha[0]
+
+    with torch.no_grad():
+        image, alpha = by_torch(sh, 3)
+        drawn, weighed = picture(scene, camera, Quality(), 10**6), weights(scene, camera, Quality(), 10**6)
+    with torch.enable_grad():
+        flat = torch.zeros(count, 1, requires_grad=True)
+        (pixels,) = torch.autograd.grad(by_torch(flat, None)[0].sum(), flat)
+    if drawn is None or weighed is None:
+        return False
+    return agreement([*drawn, weighed], [image, alpha, pixels[:, 0]], off=1e-4, share=1e-2)
+
+
+KERNELS = Kernels("the rasterizer", Path(__file__).with_name("compiled") / "pictures.cpp", _as_torch)

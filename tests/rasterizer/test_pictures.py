@@ -1,0 +1,160 @@
+"""Pictures drawn in one pass are those of torch, from ordinary scenes to degenerate ones."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from making import assert_same_on_any_threads, normal_scene
+from pointsplat_ns.rasterizer import pictures, pixels_of, rasterization, render
+from pointsplat_ns.rasterizer import scene as drawing
+from pointsplat_ns.views import View
+
+WIDTH, HEIGHT = 67, 43
+
+missing = pictures.KERNELS.why_missing
+needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
+
+
+def scene_of(degree=3, count=3000):
+    """Gaussians in and around a picture, and behind the camera."""
+    scene = normal_scene(count, degree, seed=3)
+    means = scene.means * torch.tensor([2.0, 1.5, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
+    return scene.replace(means=means, scales=0.7 * scene.scales - 2.5)
+
+
+def view_of(mode="classic"):
+    K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 52.0, 24.0], [0.0, 0.0, 1.0]])
+    return View(torch.eye(4).double(), K, WIDTH, HEIGHT, rasterize_mode=mode, background=torch.tensor([0.2, 0.5, 0.9]))
+
+
+def by_torch(scene, view, dtype=torch.float64):
+    """The picture over the view's background, its alpha, and the pixels of each Gaussian, in torch."""
+    scene = scene.to(dtype)
+    flat = torch.zeros(len(scene), 4, dtype=dtype, requires_grad=True)
+
+    def drawn(colors, **options):
+        return rasterization(
+            scene.means, scene.quats, scene.stds, scene.alphas, colors, view.viewmat[None], view.K[None].to(dtype),
+            WIDTH, HEIGHT, near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
+            rasterize_mode=view.rasterize_mode, compiled=False, **options,
+        )  # fmt: skip
+
+    (pixels,) = torch.autograd.grad(drawn(flat[:, :1])[0].sum(), flat)
+    image, alpha, _ = drawn((scene.features_dc, scene.features_rest), sh_degree=scene.sh_degree)
+    image = (image + (1 - alpha) * view.background.to(dtype)).clamp(0, 1)
+    return image[0], alpha[0], pixels[:, 0]
+
+
+def _far(scene, view):
+    shift = torch.tensor([1e6, -7e5, 4e5], dtype=torch.float64)
+    means = (scene.means * 64 + shift).float()
+    viewmat = view.viewmat.clone()
+    viewmat[:3, 3] = -shift
+    return scene.replace(means=means, scales=scene.scales + math.log(64)), replace(view, viewmat=viewmat)
+
+
+def _needles(scene, view):
+    return scene.replace(scales=torch.tensor([0.0, -9.0, -9.0]).expand(len(scene), 3).contiguous()), view
+
+
+def _large(scene, view):
+    return scene.replace(scales=scene.scales + 4), view
+
+
+def _tiny(scene, view):
+    return scene.replace(scales=scene.scales - 8), view
+
+
+def _meaningless(scene, view):
+    tensors = [value.clone() for value in scene.tensors()]
+    for i, wrong in enumerate((math.nan, math.inf, -math.inf, 1e38)):
+        for j, tensor in enumerate(tensors):
+            rows = tensor[60 * i + 10 * j : 60 * i + 10 * j + 10].view(10, -1)
+            rows[torch.arange(10), torch.arange(10) % rows.shape[1]] = wrong
+    return type(scene)(*tensors), view
+
+
+def _at_one_depth(scene, view):
+    means = scene.means.clone()
+    means[:, 2] = 2.0
+    return scene.replace(means=means), view
+
+
+def _behind(scene, view):
+    return scene.replace(means=scene.means * torch.tensor([1.0, 1.0, -1.0]) - 3), view
+
+
+CHANGES = [_far, _needles, _large, _tiny, _meaningless, _at_one_depth, _behind]
+
+
+@needs_compiler
+@torch.no_grad()
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary")
+def test_pictures_and_pixels_are_those_of_torch(change, mode):
+    scene, view = scene_of(), view_of(mode)
+    scene, view = change(scene, view) if change else (scene, view)
+    assert pictures.can_draw(scene, None)
+    image, alpha = drawing.render_with_alpha(scene, view)
+    dtype = torch.float32 if change is _meaningless else torch.float64  # which holds colours that float32 does not
+    with torch.enable_grad():
+        wanted, wanted_alpha, wanted_pixels = by_torch(scene, view, dtype)
+    # float32 against float64: a pixel at the threshold of 1/255 may fall either way, and then differs by so much
+    for ours, torchs in ((image, wanted), (alpha, wanted_alpha)):
+        off = (ours - torchs).abs()
+        assert off.max() < 1.5 / 255 and (off > 1e-4).float().mean() < 0.01
+    pixels = pixels_of(scene, view)
+    assert ((pixels - wanted_pixels).abs() > 1e-3 * (1 + wanted_pixels)).float().mean() < 0.02
+    assert (float(alpha.sum()) == 0.0) == (change is _behind)
+
+
+@needs_compiler
+@torch.no_grad()
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("quality", ["exact", "balanced", "fast"])
+def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monkeypatch):
+    scene, view = scene_of(degree), view_of()
+    at_once = drawing.render_with_alpha(scene, view, quality)
+    monkeypatch.setattr(drawing, "MOST_PAIRS", 10)  # as a picture of too many pairs is drawn
+    for ours, others in zip(at_once, drawing.render_with_alpha(scene, view, quality), strict=True):
+        torch.testing.assert_close(ours, others, rtol=0, atol=1e-6)
+
+
+@needs_compiler
+@torch.no_grad()
+def test_pictures_are_the_same_on_any_threads():
+    scene, view = scene_of(count=30_000), view_of()
+    assert_same_on_any_threads(lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)])
+
+
+@needs_compiler
+@torch.no_grad()
+def test_long_lists_of_a_tile_are_in_the_order_of_depth_and_equal_depths_in_that_of_gaussians():
+    count = 2000
+    g = torch.Generator().manual_seed(4)
+    scene = normal_scene(count, 0, seed=4)
+    means = torch.zeros(count, 3)
+    means[:, 2] = torch.randint(1, 300, (count,), generator=g) / 50
+    scene = scene.replace(means=means, scales=torch.full((count, 3), -3.0), opacities=torch.full((count, 1), -4.0))
+    camera = drawing._camera(scene, view_of())
+    found = pictures._placed(scene, camera, True, drawing.QUALITIES["exact"], 10**6)
+    _, pairs, offsets = found
+    wanted = means[:, 2].sort(stable=True).indices
+    lengths = offsets.diff()
+    longest = int(lengths.argmax())
+    assert int(lengths.max()) == count
+    assert torch.equal(pairs[offsets[longest] : offsets[longest + 1]], wanted)
+
+
+@needs_compiler
+def test_a_scene_with_gradients_and_other_precisions_are_left_to_the_general_way():
+    scene, view = scene_of(1, 50), view_of()
+    leaf = scene.replace(features_dc=scene.features_dc.clone().requires_grad_())
+    assert not pictures.can_draw(leaf, None) and not pictures.can_draw(scene.to(torch.float64), None)
+    assert not pictures.can_draw(scene, False) and pictures.can_draw(scene, None)
+    render(leaf, view).sum().backward()
+    assert leaf.features_dc.grad.abs().sum() > 0
+    with torch.no_grad():
+        assert pictures.can_draw(leaf, None)
