@@ -166,15 +166,16 @@ def saved(scene: ps.Gaussians, folder: Path) -> bytes:
     ("arguments", "options"),
     [
         ((), {}),
-        (("--keep", "10%"), {"keep": "10%"}),
         (
             ("--keep", "50", "--by", "paper", "--opacity-weight", "0.7", "--sh", "0"),
             {"keep": 50, "by": "paper", "opacity_weight": 0.7, "sh": "0"},
         ),
         (("--keep", "0.01MB", "--sh", "auto"), {"keep": "0.01MB", "sh": "auto"}),
         (("--keep", "auto:20", "--by", "coverage"), {"keep": "auto:20", "by": "coverage"}),
-        (("--keep", "50%", "--by", "volume", "--clean"), {"keep": "50%", "by": "volume", "clean": True}),
-        (("--keep", "20%", "--by", "area", "--fine-tune", "2"), {"keep": 0.2, "by": "area", "fine_tune": 2}),
+        (
+            ("--keep", "20%", "--by", "area", "--fine-tune", "2", "--clean"),
+            {"keep": 0.2, "by": "area", "fine_tune": 2, "clean": True},
+        ),
     ],
 )
 def test_pointsplat_prune_writes_what_prune_gives(arguments, options, ply, tmp_path):

@@ -123,7 +123,7 @@ def test_files_of_equal_sizes_are_compared_and_drawn(tmp_path, monkeypatch, caps
     def measure(**options: object) -> list[dict]:
         judge_of_bytes.main(
             (tmp_path / "small.ply",), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
-            width=96, json_path=found, **options,
+            width=48, json_path=found, **options,
         )  # fmt: skip
         return json.loads(found.read_text())["rows"]
 

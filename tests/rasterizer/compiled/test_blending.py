@@ -81,16 +81,9 @@ for compiled in (None, True):
 """
 
 
-@pytest.mark.parametrize("broken", ["no compiler", "a compiler that fails", "no cache"])
+@pytest.mark.parametrize("broken", ["no compiler", "no cache"])
 def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp_path):
-    failing = tmp_path / "c++"
-    failing.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n")
-    failing.chmod(0o755)
-    changes = {
-        "no compiler": {"CXX": "/nonexistent/c++"},
-        "a compiler that fails": {"CXX": str(failing)},
-        "no cache": {"POINTSPLAT_CACHE": "/proc/nothing"},
-    }[broken]
+    changes = {"CXX": "/nonexistent/c++"} if broken == "no compiler" else {"POINTSPLAT_CACHE": "/proc/nothing"}
     environment = {**os.environ, "POINTSPLAT_CACHE": str(tmp_path / "cache"), **changes}
     root = str(Path(blending.__file__).parents[3])
     ran = subprocess.run(
@@ -108,5 +101,5 @@ def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp
         assert second == first
     else:
         count, value, message = second.split("|")
-        reason = {"no compiler": "which is not there", "a compiler that fails": "no space left"}.get(broken, "compiler")
+        reason = "which is not there" if broken == "no compiler" else "compiler"
         assert (count, value) == ("1", "0.635") and "stays with torch" in message and reason in message
