@@ -131,24 +131,6 @@ def test_the_errors_in_the_manifest_are_those_of_the_files(folder, scene, views)
         assert [error["times"] for error in level["psnr_farther"]] == [2, 4, 8]
 
 
-def test_errors_from_afar_are_against_the_mean_of_the_pixels_that_one_covers_there(folder, scene, views):
-    manifest = manifest_of(folder)
-    scenes = [scene, *(ps.load(folder / level["file"]) for level in manifest["levels"])]
-    dense = np.stack([ps.render(scene, view).double().numpy() for view in views])  # [C, H, W, 3]
-    covered = np.mean(DenseReference(scene, views).covered)
-    for one, facts in zip(scenes, [manifest["source"], *manifest["levels"]], strict=True):
-        assert [error["times"] for error in facts["psnr_farther"]] == [2, 4, 8]
-        for error in facts["psnr_farther"]:
-            times, rows, columns = error["times"], 36 // error["times"], 48 // error["times"]
-            whole = dense[:, : rows * times, : columns * times]
-            wanted = whole.reshape(3, rows, times, columns, times, 3).mean(axis=(2, 4))
-            Ks = views.Ks.clone()
-            Ks[:, :2] /= times
-            far = ps.Views(views.viewmats, Ks, columns, rows, views.background)
-            seen = np.stack([ps.render(one, view).double().numpy() for view in far])
-            assert error["psnr"] == pytest.approx(psnr(((seen - wanted) ** 2).mean() / covered), abs=1e-4)
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 

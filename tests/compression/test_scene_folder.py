@@ -101,20 +101,6 @@ def test_a_scene_that_has_changed_is_made_again(folder):
     assert len(read_ply(results["a"].output)) == 5
 
 
-@pytest.mark.parametrize("kind", ["of somebody else", "changed since"])
-def test_a_file_that_is_not_its_own_result_is_replaced_by_force_alone(folder, kind):
-    output = folder.parent / "small" / "a.ply"
-    if kind == "changed since":
-        settle(folder)
-    write_ply(cloud(2), output)
-    before = output.read_bytes()
-    refused = settle(folder)["a"]
-    assert refused.status == "failed" and "exists already" in refused.error and "--force" in refused.error
-    assert output.read_bytes() == before
-    assert settle(folder, force=True)["a"].status == "done"
-    assert len(read_ply(output)) == 3
-
-
 def test_other_options_need_another_folder_or_force(folder):
     settle(folder)
     other = command_in(folder.parent, keep="10%")

@@ -44,14 +44,6 @@ def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
     assert all(value.is_contiguous() for value in back.tensors())
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_written_header_is_the_references_to_the_letter(tmp_path, degree):
-    write_ply(normal_scene(7, degree), tmp_path / "a.ply")
-    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode()
-    expected = ["ply", "format binary_little_endian 1.0", "element vertex 7"]
-    assert header.splitlines() == expected + [f"property float {name}" for name in column_names(degree)]
-
-
 def test_no_infinite_value_is_read_or_written_and_what_is_drawn_stays(tmp_path, caplog):
     scene = normal_scene(8, 0)
     write_ply(scene, tmp_path / "a.ply")

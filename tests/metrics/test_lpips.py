@@ -125,18 +125,6 @@ def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net,
 # As a part of a model
 
 
-def test_a_parent_model_neither_trains_it_nor_saves_it(alex):
-    parent = torch.nn.Module()
-    parent.lpips, parent.layer = alex, torch.nn.Linear(2, 2)
-    assert sorted(parent.state_dict()) == ["layer.bias", "layer.weight"]
-    assert len(list(parent.parameters())) == 2
-    parent.load_state_dict(parent.state_dict(), strict=True)
-    parent.double()
-    assert alex.features[0].weight.dtype == torch.float64  # it moves along
-    parent.train()
-    assert parent.lpips(*pair(40, 40, dtype=torch.float64)).isfinite()
-
-
 # Loaded once
 
 

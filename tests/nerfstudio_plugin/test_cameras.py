@@ -50,18 +50,6 @@ def test_a_view_sees_a_point_at_the_pixel_where_nerfstudios_ray_to_it_starts(vie
     torch.testing.assert_close(pixel[:2] / pixel[2], at.flip(0), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_cameras_of_views_are_the_pinhole_cameras_that_the_views_were_made_of_in_float32(views, dtype):
-    views = dataclasses.replace(views, viewmats=views.viewmats.to(dtype), Ks=views.Ks.to(dtype))
-    assert (len(views), views.width, views.height, views.rasterize_mode) == (3, 40, 30, "antialiased")
-    back = cameras_of_views(views)
-    # 1e-6: one inversion of a float32 pose
-    torch.testing.assert_close(back.camera_to_worlds, some_cameras().camera_to_worlds, atol=1e-6, rtol=0)
-    assert torch.equal(back.get_intrinsics_matrices(), some_cameras().get_intrinsics_matrices())
-    assert back.distortion_params is None and (back.width == 40).all() and (back.height == 30).all()
-    assert (back.camera_to_worlds.dtype, back.fx.dtype) == (torch.float32, torch.float32)
-
-
 @pytest.mark.parametrize(("near_plane", "eps2d"), [(NEAR_PLANE, EPS2D), (1e-7, 0.0), (300.0, 1.0)])
 def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_plane, eps2d):
     cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane, eps2d=eps2d))
@@ -114,17 +102,6 @@ def run(trained_walls) -> Path:
     """The run of SH degree 1 over white."""
     (config,) = (trained_walls / "wall-b").rglob("config.yml")
     return config.parent
-
-
-def test_photos_come_with_the_views_that_they_show(run):
-    """What a camera of these views sees of a wall with the photos' colours: the middle pixel of each photo."""
-    views, photos = dataset_photos(run, "test", 100)
-    poses = ps.dataset_views(run, "test")
-    assert len(views) == len(photos) == len(poses)
-    assert torch.allclose(views.viewmats, poses.viewmats, atol=1e-6) and torch.allclose(views.Ks, poses.Ks)
-    assert all(photo.shape == (views.height, views.width, 3) for photo in photos)
-    assert all(0 <= float(photo.min()) and 0.5 < float(photo.max()) <= 1 for photo in photos)
-    assert torch.equal(views.background, poses.background) and views.rasterize_mode == "antialiased"
 
 
 def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):

@@ -1,8 +1,6 @@
 """The walk over settings, and targets."""
 
 import itertools
-import math
-from dataclasses import replace
 
 import pytest
 
@@ -83,23 +81,6 @@ def test_what_will_be_recommended_is_looked_for_first(within, most, factor):
 def test_an_interrupted_walk_goes_on_as_it_would_have(known):
     whole, resumed = walked(Trade(), most=14), walked(Trade(), most=14, known=known)
     assert list(whole) == list(resumed)
-
-
-def test_photos_go_before_renders():
-    """Against photos nothing is lost above three tenths, so no budget above it is looked at."""
-    trade = Trade(gains={}, cuts={0: 1.0, 1: 1.0, 2: 1.0})
-    dense = replace(trade.dense, against_photos=replace(trade.dense.against_dense, psnr=30.0))
-    measured: dict[Setting, Point] = {}
-
-    def measure(setting: Setting) -> Point:
-        kept = min(0.0, 5 * math.log2(setting.count / 30_000))
-        made = trade.measure(setting)
-        measured[setting] = replace(made, against_photos=replace(made.against_dense, psnr=30.0 + kept))
-        return measured[setting]
-
-    measure_walk(Plan(trade.count, 3, repairs=("none",)), measure, dense, trade.cut)
-    assert max(setting.count for setting in measured) == 30_000
-    assert len(measured) > 6
 
 
 def search(trade: Trade, targets: Targets, repairs=("none", "quick")) -> TargetSearch:

@@ -11,10 +11,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing import schedule as module
 from pointsplat_ns.viewing.film import to_uint8
 from pointsplat_ns.viewing.painter import Painter, PictureRequest, ViewerCamera, paint
-from pointsplat_ns.viewing.schedule import SCHEDULE, DrawingStep, Schedule, ScheduleSettings
+from pointsplat_ns.viewing.schedule import SCHEDULE, DrawingStep, Schedule
 from pointsplat_ns.viewing.selection import ReducedScene
 
 
@@ -86,25 +85,6 @@ def test_whole_picture_has_all_gaussians_and_comes_soon_where_it_is_cheap(schedu
         step = drawn(schedule, clock, 0.001)
     assert (step.side, step.share) == (960, 1.0)
     assert step.whole and rest(schedule, clock) == [], "the small picture is the whole one already"
-
-
-def test_who_waits_is_woken_by_a_request_and_by_rest(monkeypatch):
-    monkeypatch.setattr(module, "SCHEDULE", ScheduleSettings(rest_seconds=0.05))
-    schedule: Schedule[str] = Schedule(960)
-    found: list[DrawingStep[str]] = []
-
-    def draw() -> None:
-        while (step := schedule.next()) is not None:
-            found.append(step)
-            schedule.done(step, 0.1)
-            if step.side == 960:
-                return
-
-    drawing = threading.Thread(target=draw)
-    drawing.start()
-    schedule.submit("now")
-    drawing.join(10)
-    assert not drawing.is_alive() and found[0].moving and found[-1].side == 960
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,11 @@ from unittest import mock
 
 import pytest
 import torch
-from torch import nn
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
 from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 
 
 @pytest.fixture(scope="module")
@@ -153,28 +151,3 @@ def test_an_accumulation_that_means_nothing_is_refused_and_leaves_no_folder(thre
     with pytest.raises(PointSplatError, match="--gradient-accumulation-steps .*expected all or one of encoder"):
         config.setup(local_rank=0, world_size=1).setup()
     assert not (tmp_path / "outputs").exists()
-
-
-def test_a_part_is_due_after_its_own_number_of_steps_that_count_also_where_saved_in_between():
-    every, parts = {"encoder": 3, "heads": 1}, {name: [nn.Parameter(torch.zeros(2))] for name in ("encoder", "heads")}
-
-    def step(state: TrainingState, parts, number: int, skipped: bool = False) -> list[str]:
-        """One step, whose gradients are its number; gives the parts that are due."""
-        gathered = state.set_gradients_aside(number, every)
-        for parameter in (p for part in parts.values() for p in part if not skipped):
-            parameter.grad = torch.full_like(parameter, float(number))
-        return state.gather(gathered, number, every, skipped)
-
-    state = TrainingState(parts, ["a/1"])
-    state.skipped["a"] += 2
-    assert step(state, parts, 0, skipped=True) == [] and state.counted == {"encoder": 0, "heads": 0}
-    assert step(state, parts, 1) == ["heads"]
-    assert list(state.to_dict()["gradients"]) == ["encoder"], "only those that wait"
-    others = {name: [nn.Parameter(torch.zeros_like(p)) for p in part] for name, part in parts.items()}
-    resumed = TrainingState(others, ["b/1"])
-    resumed.load(state.to_dict(), ["a", "b"])
-    assert resumed.trained_on == {"a/1", "b/1"} and resumed.skipped == {"a": 2}
-    for some, trained in ((state, parts), (resumed, others)):
-        assert step(some, trained, 2) == ["encoder", "heads"] and some.counted["encoder"] == 2
-        assert [trained[name][0].grad.tolist() for name in every] == [[3.0, 3.0], [2.0, 2.0]]
-        assert "gradients" not in some.to_dict()

@@ -13,7 +13,6 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
     CappedStrategy,
     next_count,
     position_noise,
-    replaced,
     shared_opacity,
 )
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
@@ -79,22 +78,6 @@ def test_the_number_grows_by_5_percent_or_as_fast_as_needed_and_is_reached_exact
         before, number = number, next_count(number, 1000, later)
         assert 1.5 < number / before < 2.2, "the same factor each time, up to whole numbers"
     assert number == 1000
-
-
-def test_averages_of_an_optimiser_follow_their_gaussians_and_those_that_moved_start_anew():
-    old = torch.nn.Parameter(torch.arange(12.0).view(4, 3))
-    optimizer = torch.optim.Adam([old], lr=0.0)
-    old.grad = old.detach().clone() + 1
-    optimizer.step()
-    before = optimizer.state[old]["exp_avg"].clone()
-    rows, changed = torch.tensor([0, 1, 1, 3, 1]), torch.tensor([1, 2, 4])
-    new = replaced(optimizer, old, old.detach()[rows], rows, changed)
-    assert optimizer.param_groups[0]["params"] == [new] and list(optimizer.state) == [new]
-    for name in ("exp_avg", "exp_avg_sq"):
-        assert not optimizer.state[new][name][changed].any() and optimizer.state[new][name][[0, 3]].all()
-    assert torch.equal(optimizer.state[new]["exp_avg"][[0, 3]], before[[0, 3]])
-    new.grad = torch.ones_like(new)
-    optimizer.step()
 
 
 def test_the_picture_hardly_changes_where_gaussians_move_to_others():

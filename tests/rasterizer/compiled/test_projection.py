@@ -215,21 +215,6 @@ def test_where_no_gaussian_is_seen_gradients_are_zero(count):
 
 
 @needs_compiler
-@pytest.mark.parametrize("wanted", range(5))
-def test_one_gradient_alone_from_some_outputs_and_inputs_in_any_layout(wanted):
-    scene = scene_of(60)
-    grads = []
-    for compiled in (True, False):
-        leaves = [t.float() if i < 4 else t for i, t in enumerate(scene[:5])]
-        leaf = leaves[wanted].requires_grad_()
-        leaves[:4] = [t.repeat_interleave(2, 0)[::2] for t in leaves[:4]]  # not contiguous
-        seen = project(*leaves, scene[5], WIDTH, HEIGHT, compiled=compiled, antialiased=True)
-        total = seen.opacities.sum() + seen.means2d.sum() + seen.depths.sum()
-        grads.append(torch.autograd.grad(total, leaf)[0])
-    assert grads[1].any() and off(*grads)[0] <= 2e-6
-
-
-@needs_compiler
 def test_any_number_of_threads_projects_the_same_bits():
     scene = scene_of(9000)
 
