@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,29 +12,9 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
-from pointsplat_ns.io.turning import turned
+from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import axis_named
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """Turns a scene, scales it, and moves it: a point x becomes ``scale * matrix @ x + offset``."""
-
-    matrix: Tensor  # [3, 3] float64, orthogonal; a determinant of -1 mirrors
-    scale: float  # above 0
-    offset: Tensor  # [3] float64
-
-    def inverse(self) -> Similarity:
-        """The similarity that undoes this one."""
-        return Similarity(self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale)
-
-    def apply(self, scene: Gaussians) -> Gaussians:
-        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
-        moved = turned(scene.to(dtype=torch.float64), self.matrix)
-        return moved.replace(
-            means=moved.means * self.scale + self.offset.to(moved.means), scales=moved.scales + math.log(self.scale)
-        ).to(dtype=scene.dtype)
 
 
 def place(

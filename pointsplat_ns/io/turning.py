@@ -1,6 +1,9 @@
-"""Turns and mirrors scenes about the origin."""
+"""Turns, mirrors, scales and moves scenes."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -36,3 +39,23 @@ def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaus
         quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
         features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Turns a scene, scales it, and moves it: a point x becomes ``scale * matrix @ x + offset``."""
+
+    matrix: Tensor  # [3, 3] float64, orthogonal; a determinant of -1 mirrors
+    scale: float  # above 0
+    offset: Tensor  # [3] float64
+
+    def inverse(self) -> Similarity:
+        """The similarity that undoes this one."""
+        return Similarity(self.matrix.T, 1 / self.scale, -(self.matrix.T @ self.offset) / self.scale)
+
+    def apply(self, scene: Gaussians) -> Gaussians:
+        """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
+        moved = turned(scene.to(dtype=torch.float64), self.matrix)
+        return moved.replace(
+            means=moved.means * self.scale + self.offset.to(moved.means), scales=moved.scales + math.log(self.scale)
+        ).to(dtype=scene.dtype)

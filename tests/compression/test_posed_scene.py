@@ -11,11 +11,12 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, cloud, run_of
-from pointsplat_ns.compression.placing import Similarity, run_frame
+from pointsplat_ns.compression.placing import run_frame
 from pointsplat_ns.compression.posed_scene import check_views_show, read_posed
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.upright import axis_named
 from posing import inria, nerfstudio, written
 

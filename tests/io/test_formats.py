@@ -1,9 +1,6 @@
 """Scene files of every format: what comes back, that the order is known, and that sizes are as said."""
 
-import functools
-import json
 import logging
-import struct
 
 import numpy as np
 import pytest
@@ -162,40 +159,6 @@ def test_a_sog_folder_is_read_by_either_of_its_names_and_holds_what_the_file_hol
     assert same_bits(scenes[0], scenes[1]) and same_bits(scenes[0], scenes[2])
 
 
-def test_glb_holds_the_numbers_as_the_extension_names_them(tmp_path):
-    scene = cloud(7, 0, 2)
-    ps.save(scene, tmp_path / "a.glb")
-    data = (tmp_path / "a.glb").read_bytes()
-    magic, version, length, text_length, kind = struct.unpack_from("<4sIII4s", data)
-    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
-    content = json.loads(data[20 : 20 + text_length])
-    binary = data[20 + text_length + 8 :]
-    assert content["buffers"][0]["byteLength"] == len(binary)
-    (primitive,) = content["meshes"][0]["primitives"]
-    assert primitive["mode"] == 0 and primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
-
-    def array(name):
-        accessor = content["accessors"][primitive["attributes"][name]]
-        view = content["bufferViews"][accessor["bufferView"]]
-        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        return np.frombuffer(part, "u1" if accessor["componentType"] == 5121 else "<f4").reshape(accessor["count"], -1)
-
-    named = functools.partial("KHR_gaussian_splatting:{}".format)
-    assert np.array_equal(array("POSITION"), scene.means.numpy())
-    assert np.array_equal(array(named("SCALE")), scene.stds.numpy())
-    assert np.allclose(array(named("OPACITY"))[:, 0], scene.alphas.numpy())
-    unit = torch.nn.functional.normalize(scene.quats, dim=1)[:, [1, 2, 3, 0]]  # xyzw
-    assert np.allclose(array(named("ROTATION")), unit.numpy(), atol=1e-6)
-    assert np.array_equal(array(named("SH_DEGREE_0_COEF_0")), scene.features_dc.numpy())
-    assert np.array_equal(array(named("SH_DEGREE_2_COEF_4")), scene.features_rest[:, 7].numpy())
-    assert len(primitive["attributes"]) == 2 + 3 + 9
-    assert array("COLOR_0").shape == (7, 4)
-    back = ps.load(tmp_path / "a.glb")
-    assert torch.equal(back.means, scene.means) and torch.equal(back.sh, scene.sh)
-    assert torch.allclose(back.scales, scene.scales, atol=1e-6) and torch.allclose(back.quats, unit[:, [3, 0, 1, 2]])
-    assert torch.allclose(back.opacities, scene.opacities, rtol=1e-3, atol=1e-4)  # float32 opacities near 1
-
-
 def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):
     names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(72)), "opacity"]
     names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -239,92 +202,6 @@ def test_files_that_others_published_are_read(name, caplog):
     assert bool(scene.opacities.isfinite().all()) and bool(scene.usable().all())
     assert "dropped" not in caplog.text
     assert format_to_read(SPLATS / name).name in ("compressed PLY", "SPZ", "SOG", "SOG folder")
-
-
-def glb_of(arrays, about=None, nodes=({"mesh": 0},), **changes):
-    """The bytes of a ``.glb`` of one primitive: name of attribute to (array, normalized)."""
-    accessors, views, binary = [], [], b""
-    kinds = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "float32": 5126}
-    for array, normalized in arrays.values():
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes})
-        accessors.append(
-            {
-                "bufferView": len(views) - 1,
-                "componentType": kinds[array.dtype.name],
-                "count": len(array),
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]],
-                "normalized": normalized,
-            }
-        )
-        binary += array.tobytes() + bytes(-array.nbytes % 4)
-    names = [name if name == "POSITION" else f"KHR_gaussian_splatting:{name}" for name in arrays]
-    extension = {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", **(about or {})}}
-    primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(names)}, "extensions": extension}
-    content = {
-        "asset": {"version": "2.0"},
-        "nodes": list(nodes),
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(binary)}],
-        **changes,
-    }
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-
-
-def small_integers():
-    """Attributes of three Gaussians in the smallest types that the extension allows."""
-    return {
-        "POSITION": (np.arange(9, dtype=np.float32).reshape(3, 3), False),
-        "ROTATION": (np.array([[0, 0, 0, 127], [127, 0, 0, 0], [0, -128, 0, 0]], np.int8), True),
-        "SCALE": (np.array([[1, 2, 3], [4, 5, 6], [7, 8, 0]], np.int16), False),
-        "OPACITY": (np.array([[0], [32768], [65535]], np.uint16), True),
-        "SH_DEGREE_0_COEF_0": (np.ones((3, 3), np.float32), False),
-    }
-
-
-def test_glb_of_several_primitives_is_one_scene_and_its_nodes_are_named(tmp_path, caplog):
-    data = glb_of(small_integers(), nodes=[{"mesh": 0, "scale": [2, 2, 2]}])
-    size = struct.unpack_from("<I", data, 12)[0]
-    content = json.loads(data[20 : 20 + size])
-    content["meshes"] *= 2
-    text = json.dumps(content).encode()
-    (tmp_path / "a.glb").write_bytes(data[:12] + struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :])
-    assert len(ps.load(tmp_path / "a.glb")) == 6
-    assert "transforms of its nodes are not applied" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"meshes": []}, "no Gaussians"),
-        ({"about": {"extensions": {"KHR_gaussian_splatting_compression_spz": {}}}}, "compression_spz"),
-        ({"about": {"kernel": "cube"}}, "the kernel cube"),
-        ({"buffers": [{"byteLength": 1, "uri": "a.bin"}]}, "another file"),
-        ({"accessors": []}, "damaged glTF"),
-        ({"bufferViews": [{"buffer": 0, "byteLength": 1 << 60}] * 5}, "truncated"),
-        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 1 << 60, "type": "VEC3"}] * 5}, "truncated"),
-        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": -1, "type": "VEC3"}] * 5}, "damaged glTF"),
-        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 1, "type": "MAT4"}] * 5}, "damaged glTF"),
-        ({"accessors": [{"componentType": 5126, "count": 1, "type": "VEC3"}] * 5}, "sparse"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else None,
-)
-def test_glb_that_lies_or_needs_more_is_one_error(tmp_path, changes, said):
-    (tmp_path / "a.glb").write_bytes(glb_of(small_integers(), **changes))
-    with pytest.raises(ps.SceneError, match=said):
-        ps.load(tmp_path / "a.glb")
-
-
-def test_glb_cut_anywhere_is_one_error(tmp_path):
-    data = glb_of(small_integers())
-    for size in range(0, len(data), 7):
-        (tmp_path / "a.glb").write_bytes(data[:size])
-        with pytest.raises(ps.SceneError):
-            ps.load(tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize("name", ["a.lcc", "a.lcc2"])

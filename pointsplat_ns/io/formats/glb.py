@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     Array,
@@ -29,41 +31,86 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.system.progress import Progress, silent
 
 JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
 
 _EXTENSION = "KHR_gaussian_splatting"
+_MOST_PLACES = 10_000  # nodes with Gaussians
 
 
 def read_glb(path: Path | str) -> Gaussians:
-    """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does. The transforms of nodes are not
-    applied, which is logged. Raises SceneError if there are no Gaussians, they are compressed or lie in other files, or
-    the file is damaged."""
+    """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does, where its nodes place them. Nodes
+    that skew or scale unevenly are not applied, which is logged. Raises SceneError if there are no Gaussians, they are
+    compressed or lie in other files, or the file is damaged."""
     path = require_file(path, "a .glb file")
     with damage_named(path, "glTF"):
         content, binary = _chunks(load_bytes(path), path)
-        found = [
-            (primitive, primitive["extensions"][_EXTENSION])
-            for mesh in content.get("meshes", [])
-            for primitive in mesh["primitives"]
-            if _EXTENSION in primitive.get("extensions", {})
-        ]
-        if not found:
+        meshes: dict[int, Gaussians] = {}
+        for index, mesh in enumerate(content.get("meshes", [])):
+            found = [one for one in mesh["primitives"] if _EXTENSION in one.get("extensions", {})]
+            if found:
+                meshes[index] = joined([_primitive(primitive, content, binary, path) for primitive in found])
+        if not meshes:
             raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
-        if any({"matrix", "translation", "rotation", "scale"} & node.keys() for node in content.get("nodes", [])):
-            logger.warning("%s: the transforms of its nodes are not applied", path)
-        parts = []
-        for primitive, about in found:
-            others = [*about.get("extensions", {})]
-            if others or about.get("kernel", "ellipse") != "ellipse":
-                wanted = ", ".join([*others, f"the kernel {about.get('kernel')}"])
-                raise SceneError(f"{path}: its Gaussians need {wanted}; expected {_EXTENSION} alone, of ellipses")
-            if about.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
-                logger.warning("%s: colours of the space %s are read as sRGB", path, about["colorSpace"])
-            parts.append(_primitive(primitive["attributes"], content, binary, path))
-    return keep_usable(joined(parts), path)
+        placed = [(meshes[index], matrix) for index, matrix in _shown(content) if index in meshes]
+        if len(placed) > _MOST_PLACES:
+            raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most {_MOST_PLACES}")
+        require_memory(path, 4 * sum(len(mesh) * (11 + 3 * (mesh.sh_degree + 1) ** 2) for mesh, _ in placed))
+        parts = [_moved(mesh, matrix, path) for mesh, matrix in placed]
+    return keep_usable(joined(parts or [*meshes.values()]), path)
+
+
+def _shown(content: dict[str, Any]) -> list[tuple[int, Array]]:
+    """The meshes that nodes of the scene have, by index, each with the matrix (4, 4) float64 from it to the world."""
+    nodes, found, seen = content.get("nodes", []), [], set()
+    if content.get("scenes"):
+        roots = _entry(content["scenes"], content.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in children]
+    waiting = [(root, np.eye(4)) for root in roots]
+    while waiting:
+        index, above = waiting.pop()
+        node = _entry(nodes, index)
+        if index in seen:
+            raise ValueError(f"node {index} has two parents")
+        seen.add(index)
+        matrix = above @ _matrix(node)
+        if "mesh" in node:
+            found.append((node["mesh"], matrix))
+        waiting += [(child, matrix) for child in node.get("children", [])]
+    return found[::-1]
+
+
+def _matrix(node: dict[str, Any]) -> Array:
+    """The matrix (4, 4) float64 of a node."""
+    if "matrix" in node:
+        matrix = np.asarray(node["matrix"], np.float64).reshape(4, 4).T  # a file has columns
+    else:
+        matrix = np.eye(4)
+        x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+        turn = rotation_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+        matrix[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        matrix[:3, 3] = np.asarray(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    if not np.isfinite(matrix).all():
+        raise ValueError("a node's transform is not finite")
+    return matrix
+
+
+def _moved(scene: Gaussians, matrix: Array, path: Path) -> Gaussians:
+    """A scene where a node places it."""
+    if np.array_equal(matrix, np.eye(4)):
+        return scene
+    linear = torch.from_numpy(matrix[:3, :3].copy())
+    scale = float(torch.linalg.det(linear).abs()) ** (1 / 3)
+    turn = linear / scale if scale > 0 else linear
+    if not torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-4):
+        logger.warning("%s: a node that skews or scales unevenly is not applied", path)
+        return scene
+    return Similarity(turn, scale, torch.from_numpy(matrix[:3, 3].copy())).apply(scene)
 
 
 def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -86,8 +133,15 @@ def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:
     return content, memoryview(data)[28 + size : 28 + size + length]
 
 
-def _primitive(attributes: dict[str, int], content: dict[str, Any], binary: memoryview, path: Path) -> Gaussians:
+def _primitive(primitive: dict[str, Any], content: dict[str, Any], binary: memoryview, path: Path) -> Gaussians:
     """The Gaussians of one primitive, by the accessors of its attributes."""
+    attributes, about = primitive["attributes"], primitive["extensions"][_EXTENSION]
+    others = [*about.get("extensions", {})]
+    if others or about.get("kernel", "ellipse") != "ellipse":
+        wanted = ", ".join([*others, f"the kernel {about.get('kernel')}"])
+        raise SceneError(f"{path}: its Gaussians need {wanted}; expected {_EXTENSION} alone, of ellipses")
+    if about.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
+        logger.warning("%s: colours of the space %s are read as sRGB", path, about["colorSpace"])
 
     def values(name: str, columns: int) -> Array:
         return _numbers(attributes[name], columns, content, binary, path)

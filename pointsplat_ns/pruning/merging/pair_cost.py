@@ -15,7 +15,7 @@ and counts as well:
     surroundings_i = the mean colour of that cover
 
 The factor g^2 is empirical: E and H do not see how a large replacement blurs what is merged with it later. On five
-scenes it gains 0.2 dB at 10 % and 0.4 at 30 %, and viewers draw 6 % fewer Gaussians on a pixel; g^3 loses with poses.
+scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers draw 6 % fewer Gaussians on a pixel; g^3 loses with poses.
 
 W_i is the visibility weight of i. c_0, b, c_min and d are ``min_contrast``, ``background_contrast``, ``min_cover`` and
 ``background_decay`` of the settings. The replacement has the common mass, centre and covariance, as in
