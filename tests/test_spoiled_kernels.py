@@ -68,3 +68,10 @@ def test_kernels_that_do_not_do_as_torch_does_are_not_used(module, right, wrong,
     with pytest.warns(UserWarning, match=f"stays with torch: what the compiler made of {kernels.source.name} does not"):
         assert not changed.usable(True)
     assert not changed.usable_for(None, torch.zeros(1, 3))
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="there is no C++ compiler")
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__.rpartition(".")[2])
+def test_where_there_is_a_compiler_kernels_do_as_torch_does(module):
+    """Other tests of kernels skip where they cannot be used."""
+    assert module.KERNELS.why_missing == ""

@@ -13,7 +13,7 @@ from making import cloud, normal_scene
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import never_replaced, replacing
 from pointsplat_ns.io.scene import save
 from pointsplat_ns.io.source import source_file
 
@@ -72,6 +72,16 @@ def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
         part.write_text("half")
         raise KeyError
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_file_that_is_not_to_be_replaced_may_be_again_afterwards(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_text("old")
+    with never_replaced(path), pytest.raises(SceneError, match="appeared meanwhile"), replacing(path) as part:
+        part.write_text("new")
+    with replacing(path) as part:
+        part.write_text("newer")
+    assert path.read_text() == "newer"
 
 
 def test_of_a_file_it_is_the_hash_of_its_bytes(tmp_path):
