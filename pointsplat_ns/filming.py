@@ -13,7 +13,8 @@ from pointsplat_ns.api import Source, load
 from pointsplat_ns.compression.posed_scene import check_views_show, views_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.io.formats import coarser_levels
+from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -156,7 +157,8 @@ def open_viewer(
     for index, source in enumerate(source for source in (scene, other) if source is not None):
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
-        scenes.append(ViewedScene(_name(source, index), path, loaded, _source(source, loaded, None)))
+        levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
+        scenes.append(ViewedScene(_name(source, index), path, loaded, _source(source, loaded, None), levels))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 

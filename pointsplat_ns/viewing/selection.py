@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -48,11 +48,19 @@ class Selection:
     """A scene at a budget that may change. :meth:`choose` acts at once; after ``rest`` seconds without a new budget, a
     thread merges to the same budget, which gives the scene that ``pointsplat prune`` writes.
 
-    Undrawable Gaussians are left out. Merging uses the dataset's views of ``source``. ``changed`` is called from any
+    Undrawable Gaussians are left out. ``levels`` are smaller scenes that are there already; each stands for budgets
+    near its count. Merging uses the dataset's views of ``source``. ``changed`` is called from any
     thread, with True for a new scene, and with False for new status text alone.
     """
 
-    def __init__(self, scene: Gaussians, source: ViewSource, changed: Callable[[bool], None], rest: float = 1.0):
+    def __init__(
+        self,
+        scene: Gaussians,
+        source: ViewSource,
+        changed: Callable[[bool], None],
+        rest: float = 1.0,
+        levels: Sequence[Gaussians] = (),
+    ):
         self.scene = keep_usable(scene, "the scene")
         """All drawable Gaussians."""
         self.whole = ReducedScene(self.scene, "all")
@@ -62,6 +70,7 @@ class Selection:
         self.status = ""
         """Text on the thread's work; empty if it waits."""
         self._merged: dict[int, ReducedScene] = {}
+        self._levels = [ReducedScene(level, f"level {n} of the stream") for n, level in enumerate(levels, start=1)]
         self._source, self._report, self._rest = source, changed, rest
         self._wanted = 100
         self._changed = threading.Condition()
@@ -96,9 +105,19 @@ class Selection:
         """The best scene at a budget without new merging."""
         if percent == 100:
             return self.whole
-        if percent in self._merged:
-            return self._merged[percent]
+        there = self._level(percent) or self._merged.get(percent)
+        if there is not None:
+            return there
         return ReducedScene(self.scene[select(self._scores, self._count(percent))], "chosen by coverage")
+
+    def _level(self, percent: int) -> ReducedScene | None:
+        """The level that has about as many Gaussians as a budget, to a tenth."""
+        count = len(self.scene) * percent / 100
+        near = [level for level in self._levels if abs(len(level.scene) - count) <= 0.1 * count]
+        return min(near, key=lambda level: abs(len(level.scene) - count), default=None)
+
+    def _is_there(self, percent: int) -> bool:
+        return percent == 100 or percent in self._merged or self._level(percent) is not None
 
     @cached_property
     def _scores(self) -> Tensor:
@@ -111,7 +130,7 @@ class Selection:
     def _work(self) -> None:
         while True:
             with self._changed:
-                while not self._closed and (self._wanted == 100 or self._wanted in self._merged):
+                while not self._closed and self._is_there(self._wanted):
                     self._changed.wait()
                 wanted = self._wanted
                 self._changed.wait(self._rest)

@@ -59,6 +59,8 @@ class ViewedScene:
     scene: Gaussians
     source: ViewSource
     """Source of views."""
+    levels: Sequence[Gaussians] = ()
+    """Smaller scenes that are there already, as of :class:`Selection`."""
 
 
 class _Stage:
@@ -76,7 +78,9 @@ class _Stage:
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin
         self._tell = changed
-        self.selections = [Selection(viewed.scene, viewed.source, self._changed) for viewed in scenes]
+        self.selections = [
+            Selection(viewed.scene, viewed.source, self._changed, levels=viewed.levels) for viewed in scenes
+        ]
         pair = [{"name": viewed.name, "amount": ""} for viewed in scenes]
         if len(scenes) == 1:
             pair.append({"name": "all of it", "amount": ""})

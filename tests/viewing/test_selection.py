@@ -9,6 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
+from pointsplat_ns.compression.level_stream import Chunks
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.viewing import selection as module
 from pointsplat_ns.viewing.selection import Selection
@@ -52,6 +53,22 @@ def patient(scene, news) -> Iterator[Selection]:
     made = Selection(scene, ViewSource(scene), news, rest=1000.0)
     yield made
     made.close()
+
+
+def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp_path, monkeypatch):
+    ps.lod(scene, [1.0, 0.5, 0.1], folder=tmp_path / "room", stream=Chunks())
+    shown = []
+    monkeypatch.setattr("pointsplat_ns.viewing.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
+    ps.open_viewer(tmp_path / "room")
+    (viewed,) = shown
+    made = Selection(viewed.scene, viewed.source, lambda picture: None, rest=0.0, levels=viewed.levels)
+    try:
+        for percent, how in ((50, "level 1 of the stream"), (10, "level 2 of the stream"), (30, "chosen by coverage")):
+            made.choose(percent)
+            assert made.current.how == how
+            assert len(made.current.scene) == pytest.approx(percent * len(viewed.scene) / 100, rel=0.1)
+    finally:
+        made.close()
 
 
 @pytest.mark.parametrize("percent", [1, 10, 77, 99])

@@ -17,7 +17,7 @@ from pointsplat_ns.io.formats.registry import (
 )
 from pointsplat_ns.io.formats.sog_images import META as SOG_META
 from pointsplat_ns.io.formats.sog_images import PARTS as SOG_PARTS
-from pointsplat_ns.io.formats.sog_stream import STREAM_META
+from pointsplat_ns.io.formats.sog_stream import STREAM_META, coarser_levels
 
 __all__ = [
     "FORMATS",
@@ -27,6 +27,7 @@ __all__ = [
     "STREAM_META",
     "WRITABLE",
     "Format",
+    "coarser_levels",
     "format_like",
     "format_name",
     "format_named",

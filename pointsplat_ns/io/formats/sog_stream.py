@@ -76,6 +76,23 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
     return keep_usable(joined(parts), path)
 
 
+def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
+    """All levels of a streamed SOG but the finest, which has ``finest`` Gaussians, the finer first; no more of them
+    than have twice as many Gaussians in all. None for a path that is no streamed SOG. Raises SceneError as
+    :func:`read_sog_stream`."""
+    path = path / STREAM_META if path.is_dir() else path
+    if path.name != STREAM_META or not path.is_file():
+        return []
+    with damage_named(path, "streamed SOG"):
+        count = _meta(path)["lodLevels"]
+    levels: list[Gaussians] = []
+    for level in range(1, count):
+        levels.append(read_sog_stream(path, level))
+        if sum(map(len, levels)) > 2 * finest:
+            break
+    return levels
+
+
 def stream_parts(path: Path) -> list[Path]:
     """All files of the streamed SOG with this ``lod-meta.json``, which comes first. Raises SceneError as
     :func:`read_sog_stream`."""
