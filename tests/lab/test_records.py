@@ -9,7 +9,7 @@ import torch
 from lab.judge import bytes as judge_of_bytes
 from lab.judge import camera_paths, record, tables_record
 from lab.numerics import cases, measures, report, stability
-from lab.speed import commands, rasterizer
+from lab.speed import beside, commands, rasterizer
 from lab.training import photo_places
 from making import EYES, box_room, photographed
 from peers import peer
@@ -37,6 +37,30 @@ RECORD = Path(__file__).parents[2] / "docs" / "record"
 
 def test_page_is_what_the_program_writes_from_the_rows():
     assert tables_record.page(tables_record.read(RECORD / "results.json")) == (RECORD / "results.md").read_text("utf-8")
+
+
+def test_the_page_of_times_is_what_the_program_writes_from_the_rows():
+    rows = json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]
+    assert beside.page(rows) == (RECORD / "speed.md").read_text("utf-8")
+
+
+def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(monkeypatch, tmp_path, capsys):
+    program = peer(tmp_path, "3.7.0")
+    write_ply(box_room(0, 300), tmp_path / "room.ply")
+    arguments = dict(keep=(0.5, 0.1), splat_transform=program, json_path=tmp_path / "speed.json", resume=True)
+    beside.main((tmp_path / "room.ply",), **arguments)
+    rows = json.loads((tmp_path / "speed.json").read_text("utf-8"))["rows"]
+    assert [(row["keep"], row["method"] == beside.OURS) for row in rows] == [
+        (0.5, True),
+        (0.5, False),
+        (0.1, True),
+        (0.1, False),
+    ]
+    assert all(row["cpu_seconds"] > 0 and row["peak_bytes"] > 1e6 and row["gaussians"] == 300 for row in rows)
+    first = rows[0]["cpu_seconds"], rows[1]["cpu_seconds"]
+    assert f"{first[0]:.1f} / {first[1]:.1f}: {first[0] / first[1]:.2f}" in capsys.readouterr().out
+    monkeypatch.setattr(beside, "rows_of", lambda *_: pytest.fail("measured again"))
+    beside.main((tmp_path / "room.ply",), **arguments)
 
 
 @pytest.mark.parametrize("name", ["usual", "antialiased"])
