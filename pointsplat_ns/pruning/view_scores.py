@@ -16,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.scores import ScoreError, log_volume
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
-from pointsplat_ns.rasterizer.projection import Projected, project
+from pointsplat_ns.rasterizer.projection import Projected, drawn_antialiased, project
 from pointsplat_ns.views import Views
 
 
@@ -191,7 +191,7 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         near_plane=views.near_plane,
         far_plane=math.inf,
         eps2d=views.eps2d,
-        antialiased=scene.antialiased or views.rasterize_mode == "antialiased",
+        antialiased=drawn_antialiased(scene, views),
     )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
 from pointsplat_ns.rasterizer.ewa import Lens, Project
-from pointsplat_ns.views import EPS2D, View
+from pointsplat_ns.views import EPS2D, View, Views
 
 
 @dataclass
@@ -88,13 +88,18 @@ def count_meaningless(
     return means.shape[0] - int(good.sum())
 
 
+def drawn_antialiased(scene: Gaussians, view: View | Views) -> bool:
+    """Whether a picture is antialiased: because the scene is, or the view."""
+    return scene.antialiased or view.rasterize_mode == "antialiased"
+
+
 def project_scene(scene: Gaussians, view: View) -> Projected:
     """Projection of a scene to a view, as in :func:`~pointsplat_ns.render`, on the scene's device."""
     viewmat = view.viewmat.to(scene.device)  # float32 would move a camera that is far from the origin
     return project(
         scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,
         near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
-        antialiased=scene.antialiased or view.rasterize_mode == "antialiased",
+        antialiased=drawn_antialiased(scene, view),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET
-from pointsplat_ns.rasterizer.projection import camera_of
+from pointsplat_ns.rasterizer.projection import camera_of, drawn_antialiased
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
@@ -84,7 +84,7 @@ def _over(image: Tensor, alpha: Tensor, view: View) -> Tensor:
 def _camera(scene: Gaussians, view: View) -> pictures.Camera:
     return camera_of(
         view.viewmat, view.K.to(scene.means), view.width, view.height, view.near_plane, math.inf, 0.0, view.eps2d,
-        view.rasterize_mode == "antialiased",
+        drawn_antialiased(scene, view),
     )  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         height=view.height,
         near_plane=view.near_plane,
         far_plane=math.inf,  # the unit of length may be small
-        rasterize_mode="antialiased" if scene.antialiased else view.rasterize_mode,
+        rasterize_mode="antialiased" if drawn_antialiased(scene, view) else "classic",
         eps2d=view.eps2d,
         **options,
     )
