@@ -20,6 +20,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.ply_header import ANTIALIASED, Element, Header, is_antialiased, read_header
+from pointsplat_ns.system.pieces import CHUNK
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -152,14 +153,12 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
     Raises:
         SceneError: if ``path`` cannot be written.
     """
-    from plyfile import PlyData, PlyElement
-
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
-    names = _column_names(3 * scene.features_rest.shape[1])
-    rows = row_table(scene).view([(name, "<f4") for name in names]).reshape(len(scene))
-    comments = [ANTIALIASED] if scene.antialiased else []
-    with replacing(path, ply_bytes(len(scene), scene.sh_degree, scene.antialiased)) as part:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(part))
+    about = len(scene), scene.sh_degree, scene.antialiased
+    with replacing(path, ply_bytes(*about)) as part, part.open("wb") as stream:
+        stream.write(header_bytes(*about))
+        for first in range(0, len(scene), CHUNK):
+            stream.write(row_table(scene[first : first + CHUNK]).data)
 
 
 def row_table(scene: Gaussians) -> np.ndarray:
