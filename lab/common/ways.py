@@ -17,7 +17,7 @@ WAYS: dict[Way, tuple[str, ...]] = {
 }
 """What users of the program give to make a scene smaller, but for the scene and the budget."""
 
-_PROGRAM = [sys.executable, "-c", "from pointsplat_ns.cli import main; main()"]
+_PROGRAM = [sys.executable, "-c", "from pointsplat_ns.cli import program; program()"]
 
 PEER = "splat-transform"
 """Name of the other program that is measured."""

@@ -55,7 +55,7 @@ SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, traine
 METHODS = (DENSE, *WAYS, *SCORES.values(), CAP_SHORT, CAP_LONG)
 """All ways, in the order of the tables."""
 
-_POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import main; main()")
+_POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import program; program()")
 _TRAIN = (sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()")
 
 

@@ -33,7 +33,7 @@ def commands(monkeypatch) -> list[str]:
         print(f"\n$ {command}", flush=True)
         program, *rest = words = shlex.split(command.replace("--num-seed-points 20000", "--num-seed-points 500"))
         if program == "pointsplat":
-            return main(rest)  # without words it would end this process
+            return main(rest)  # its program ends the process
         [script] = importlib.metadata.entry_points(group="console_scripts", name=program)
         with monkeypatch.context() as patch:
             patch.setattr("sys.argv", words)

@@ -140,7 +140,7 @@ def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
             patch.setattr(sys, "argv", [words[2], *words[3:]])
             runpy.run_module(words[2], run_name="__main__", alter_sys=True)
         elif words[0] == "pointsplat":
-            main(list(words[1:]))  # without words it would end this process
+            main(list(words[1:]))  # its program ends the process
         else:
             [script] = importlib.metadata.entry_points(group="console_scripts", name=words[0])
             patch.setattr(sys, "argv", list(words))
