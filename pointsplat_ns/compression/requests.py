@@ -33,7 +33,7 @@ SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
-"""Number of repair steps of each effort. "quick" takes about as long as merging 100,000 to a million Gaussians."""
+"""Number of repair steps of each effort."""
 
 
 PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 400, "thorough": 4000}
