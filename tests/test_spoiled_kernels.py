@@ -57,11 +57,10 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
 )  # fmt: skip
 def test_kernels_that_do_not_do_as_torch_does_are_not_used(module, right, wrong, times, tmp_path, monkeypatch):
     kernels = module.KERNELS
-    text = kernels.source.read_text("utf-8")
-    assert text.count(right) == times
-    (tmp_path / kernels.source.name).write_text(text.replace(right, wrong), "utf-8")
-    for header in kernels.source.parent.glob("*.h"):
-        shutil.copy(header, tmp_path)
+    texts = {path.name: path.read_text("utf-8") for path in (kernels.source, *kernels.source.parent.glob("*.h"))}
+    assert sum(text.count(right) for text in texts.values()) == times
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text.replace(right, wrong), "utf-8")
     monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
     changed = Kernels(kernels.what, tmp_path / kernels.source.name, kernels.agree)
     monkeypatch.setattr(module, "KERNELS", changed)

@@ -78,14 +78,7 @@ void color_lanes(const Colors& task, const Lanes& rows) {
     std::memcpy(basis, lanes, sizeof(lanes));
     for (int lane = 0; lane < rows.count; ++lane) {
         const float *first = coefficient(task, rows.rows[lane], 0), *rest = coefficient(task, rows.rows[lane], 1);
-        float sum[3];
-        for (int c = 0; c < 3; ++c) sum[c] = basis[0][lane] * first[c];
-        for (int k = 1; k < USED; ++k)
-            for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * rest[3 * (k - 1) + c];
-        for (int c = 0; c < 3; ++c) {
-            const float color = (sum[c] - sum[c]) + (sum[c] + 0.5f);  // NaN where it is infinite
-            task.colors[3 * rows.rows[lane] + c] = color < 0.0f ? 0.0f : color;
-        }
+        color_of<USED>(basis, lane, first, rest, task.colors + 3 * rows.rows[lane]);
     }
 }
 

@@ -29,4 +29,18 @@ void basis_of(const Lane (&unit)[3], Lane* out) {
     }
 }
 
+// The colour of one lane's Gaussian from its coefficients: constant ones, and all others in rows of 3. NaN where it is
+// not finite.
+template <int USED>
+void color_of(const float (&basis)[USED][LANES], int lane, const float* first, const float* rest, float* out) {
+    float sum[3];
+    for (int c = 0; c < 3; ++c) sum[c] = basis[0][lane] * first[c];
+    for (int k = 1; k < USED; ++k)
+        for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * rest[3 * (k - 1) + c];
+    for (int c = 0; c < 3; ++c) {
+        const float color = (sum[c] - sum[c]) + (sum[c] + 0.5f);  // NaN where it is infinite
+        out[c] = color < 0.0f ? 0.0f : color;
+    }
+}
+
 }  // namespace

@@ -48,14 +48,7 @@ void color_lanes(const Placing& task, const Lanes& lanes, const Position& at, fl
     std::memcpy(basis, values, sizeof(values));
     for (int lane = 0; lane < lanes.count; ++lane) {
         const float *first = task.first + 3 * lanes.rows[lane], *rest = task.rest + task.rest_row * lanes.rows[lane];
-        float sum[3];
-        for (int c = 0; c < 3; ++c) sum[c] = basis[0][lane] * first[c];
-        for (int k = 1; k < USED; ++k)
-            for (int c = 0; c < 3; ++c) sum[c] += basis[k][lane] * rest[3 * (k - 1) + c];
-        for (int c = 0; c < 3; ++c) {
-            const float color = (sum[c] - sum[c]) + (sum[c] + 0.5f);  // NaN where it is infinite
-            out[lane][c] = color < 0.0f ? 0.0f : color;
-        }
+        color_of<USED>(basis, lane, first, rest, out[lane]);
     }
 }
 
