@@ -200,6 +200,7 @@ def _options_in_lines(text: str) -> str:
 def program() -> NoReturn:
     """The program ``pointsplat``: :func:`main`, then the end of the process with status 0, without unloading torch's
     libraries, which takes 0.4 CPU seconds."""
+    gc.set_threshold(100_000)  # searching the objects of torch's modules for garbage takes 0.2 s by default
     main()
     atexit._run_exitfuncs()
     for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -208,14 +209,12 @@ def program() -> NoReturn:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run one subcommand; by default that of the program's own arguments, after which the process ends.
+    """Run one subcommand; by default that of the program's own arguments.
 
     Unusable input, files that cannot be read or written, a lack of memory and a missing package end it with one line
     and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
     (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
     """
-    if args is None:
-        gc.set_threshold(100_000)  # searching the objects of torch's modules for garbage takes 0.2 s by default
     with any_text_printable():
         try:
             _run(sys.argv[1:] if args is None else args)

@@ -114,15 +114,10 @@ class ViewSource:
         if self._of_dataset is not None:
             self.origin = "poses of the dataset"
             return self._at_resolution(self._of_dataset.spread(count))
-        views = self._sampled(count, 0)
-        where = (
-            "in free space" if self.sampler.photos is None else "in free space, half of them where photos were taken"
-        )
-        self.origin = f"poses sampled {where}, up is {self.up}{self.missing}"
+        views = self.sampler.views(count)
+        near = "" if self.sampler.photos is None else ", half of them where photos were taken"
+        self.origin = f"poses sampled in free space{near}, up is {self.up}{self.missing}"
         return views
-
-    def _sampled(self, count: int, seed: int) -> Views:
-        return self.sampler.views(count, seed)
 
     @cached_property
     def sampler(self) -> Sampler:
@@ -204,7 +199,7 @@ class ViewSource:
         at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
         for batch in counted(1):
             sampled = dataclasses.replace(
-                self._sampled(at_once, at_once * seed + batch),
+                self.sampler.views(at_once, at_once * seed + batch),
                 background=compared.background,
                 rasterize_mode=compared.rasterize_mode,
             )
