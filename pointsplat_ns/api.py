@@ -23,13 +23,17 @@ from pointsplat_ns.compression.trained_refiner import (
     refine,
     scenes_of_run,
 )
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.looking.upright import up_named
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.pages.stream_page import stream_page
+from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
@@ -237,6 +241,7 @@ def lod(
     up: str | None = None,
     folder: str | Path | None = None,
     stream: Chunks | None = None,
+    html: bool = False,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
@@ -254,6 +259,7 @@ def lod(
         up: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
         stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
+        html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
@@ -265,7 +271,7 @@ def lod(
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
         DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown.
+        PointSplatError: if ``sh`` is unknown, or the viewer cannot be downloaded.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -275,22 +281,29 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
+    if html and (stream is None or folder is None):
+        raise PointSplatError("a page is written beside a stream; expected --stream with --html")
+    viewer = web_viewer() if html else None
     with ExitStack() as stack:
         if folder is not None:
             if stream is None:
                 check_level_folder(Path(folder), len(budgets), force)
             else:
-                check_stream_folder(Path(folder), force)
+                check_stream_folder(Path(folder), force, viewer.files if viewer else ())
             stack.enter_context(claimed_folder(Path(folder)))
         dense, view_source = read_source(scene, views, resolution, up)
         source = None if isinstance(scene, Gaussians) else source_file(scene)
+        page = None
+        if viewer is not None and folder is not None:
+            known = view_source.known(VIEW_COUNTS.opening)
+            page = stream_page(viewer, dense, known, up_named(up), Path(folder).resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
         if folder is not None and stream is not None:
-            made.save_stream(folder, force, stream, report)
+            made.save_stream(folder, force, stream, report, page)
         elif folder is not None:
             made.save(folder, force)
-    log(made.notes)
+    log((*made.notes, *([page.note] if page else [])))
     return made
 
 

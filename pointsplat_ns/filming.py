@@ -25,6 +25,7 @@ from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
+    from pointsplat_ns.viewing.page_server import PageServer
     from pointsplat_ns.viewing.viewer import Viewer
 
 logger = logging.getLogger("pointsplat_ns")
@@ -117,14 +118,15 @@ def open_viewer(
     up: str | None = None,
     host: str = "127.0.0.1",
     port: int = 7007,
-) -> Viewer:
+) -> Viewer | PageServer:
     """Show a scene, or two scenes with the same camera, in the browser. This machine's processor draws; no GPU is
     needed.
 
     It opens upright, at the view that shows most of the scene, or the whole of an object.
 
     Args:
-        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it.
+        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it. The folder
+            of a stream with a page (``lod(html=True)``) alone shows that page, which the browser draws.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
         host: the address to listen on; by default only this machine has access. With another address, every machine
@@ -145,9 +147,12 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
+    from pointsplat_ns.viewing.page_server import PageServer, is_stream_with_page
     from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
     upward = up_named(up)
+    if isinstance(scene, (str, Path)) and other is None and up is None and is_stream_with_page(Path(scene)):
+        return PageServer(Path(scene), host, port)
 
     def read(path: Path, name: str) -> ViewedScene:
         loaded = load(path)

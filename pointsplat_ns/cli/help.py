@@ -16,7 +16,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("the smallest file of at least 32 dB", "pointsplat compact room.ply --target-db 32 -o small.sog"),
         ("every scene of a folder, four at a time", "pointsplat compact rooms --keep 10% --jobs 4"),
     ),
-    "lod": (("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),),
+    "lod": (
+        ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
+        ("a stream with a page for the web", "pointsplat lod room.ply --stream --html -o page"),
+    ),
     "tradeoff": (
         ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
         ("the smallest scene of 32 dB", "pointsplat tradeoff room.ply --target-db 32 --json"),

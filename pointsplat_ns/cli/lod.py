@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ def lod(
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: Output = None,
     stream: bool = False,
+    html: bool = False,
     chunk_count: int = 512,
     chunk_extent: float | None = None,
     sh: Bands = "all",
@@ -42,7 +44,7 @@ def lod(
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
     With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers load the parts that
-    they need.
+    they need; with --html besides, a viewer for the web beside it.
 
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
     are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
@@ -56,6 +58,9 @@ def lod(
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run. With
             --stream, the folder for lod-meta.json and its SOG files, by default room_stream.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
+        html: write PlayCanvas' SuperSplat viewer beside the stream, which is turned until -y is up, as viewers show
+            it. `pointsplat view` serves the folder. The viewer (npm, MIT, 3 MB) is downloaded once, or comes from the
+            tarball or folder that the environment variable POINTSPLAT_WEB_VIEWER names.
         chunk_count: Gaussians in a chunk of a stream, thousands of 1024, about.
         chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
@@ -82,7 +87,7 @@ def lod(
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            folder=folder, stream=chunks, force=force, progress=True,
+            folder=folder, stream=chunks, html=html, force=force, progress=True,
         )  # fmt: skip
     if json_output and stream:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
@@ -90,6 +95,8 @@ def lod(
         print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})
     else:
         _print_table(made, folder)
+        if html:
+            print(f"{shlex.join(['pointsplat', 'view', str(folder)])} shows it in the browser")
 
 
 def _print_table(made: Levels, folder: Path) -> None:

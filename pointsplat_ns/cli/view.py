@@ -17,6 +17,9 @@ def view(
     """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine's processor, no GPU
     is needed: small while the camera moves, whole once it is still. Ctrl-C ends it.
 
+    The folder of a stream with a page (`pointsplat lod --stream --html`) alone is shown by that page, which the browser
+    draws; its lod-meta.json as other scenes are.
+
     Args:
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml); by default the page
             takes a file that is dropped on it.

@@ -6,7 +6,8 @@ coarsest one. Where two leaves of different levels meet, nothing is drawn twice 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import STREAM_META
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.pages.stream_page import StreamPage, page_files
 from pointsplat_ns.system.progress import Progress, silent
 
 
@@ -39,12 +42,13 @@ class Chunks:
             raise BudgetError(f"chunks of {self.count} Gaussians and {self.extent} units; expected positive numbers")
 
 
-def check_stream_folder(folder: Path, force: bool) -> None:
-    """Raise SceneError if a stream may not be written to a folder, which need not exist."""
+def check_stream_folder(folder: Path, force: bool, page: Iterable[str] = ()) -> None:
+    """Raise SceneError if a stream, and the files of its page, may not be written to a folder, which need not exist."""
     if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
         raise SceneError(f"{folder}: a stream is several files; expected the name of a folder")
-    if (folder / STREAM_META).exists() and not force:
-        raise SceneError(f"{folder / STREAM_META}: exists already; name another folder, or overwrite it with --force")
+    for name in (STREAM_META, *page):
+        if (folder / name).exists() and not force:
+            raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
 
 def write_stream(
@@ -54,6 +58,7 @@ def write_stream(
     chunks: Chunks | None = None,
     force: bool = False,
     progress: Progress = silent,
+    page: StreamPage | None = None,
 ) -> list[int]:
     """Write levels of detail as a streamed SOG.
 
@@ -65,6 +70,7 @@ def write_stream(
         chunks: sizes of the pieces.
         force: whether an existing stream may be overwritten.
         progress: called while encoding.
+        page: written beside it; the levels are turned as it says. By default the page of an older stream is removed.
 
     Returns:
         The number of Gaussians written of each level.
@@ -73,11 +79,20 @@ def write_stream(
         SceneError: if the folder cannot be used, or a file cannot be written.
     """
     folder = Path(folder)
-    check_stream_folder(folder, force)
+    files = {} if page is None else page.files
+    check_stream_folder(folder, force, files)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
+    if page is not None and page.turn is not None:
+        scenes = [page.turn.apply(scene) for scene in scenes]
     sizes = chunks or Chunks()
     tree = partition(scenes, [of.cpu().long() for of in parents], sizes)
-    return write_sog_stream(scenes, tree, folder / STREAM_META, sizes.count, progress)["counts"]
+    with ExitStack() as stack:
+        for name, data in files.items():
+            stack.enter_context(replacing(folder / name, len(data))).write_bytes(data)
+        counts = write_sog_stream(scenes, tree, folder / STREAM_META, sizes.count, progress)["counts"]
+        for file in page_files(folder):
+            file.unlink()
+    return counts
 
 
 def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Chunks) -> Node:

@@ -37,6 +37,7 @@ from pointsplat_ns.io.source import SourceFile
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rasterizer import render
@@ -157,10 +158,12 @@ class Levels:
         force: bool = False,
         chunks: Chunks | None = None,
         progress: Progress = silent,
+        page: StreamPage | None = None,
     ) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.compression.level_stream.write_stream`. Returns the number of Gaussians of each."""
-        return write_stream(folder, self.scenes, [level.parents for level in self.levels[1:]], chunks, force, progress)
+        parents = [level.parents for level in self.levels[1:]]
+        return write_stream(folder, self.scenes, parents, chunks, force, progress, page)
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
@@ -54,7 +55,7 @@ def place(
         scene = _frame_at(original_frame).inverse().apply(scene)
     if directions is not None:
         now, wanted = directions
-        matrix = _turn(Sampler(scene).up.direction if now is None else now, wanted)
+        matrix = smallest_turn(Sampler(scene).up.direction if now is None else now, wanted)
         scene = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
     if scale != 1.0:
         scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
@@ -90,16 +91,3 @@ def _directions(up: str) -> tuple[Tensor | None, Tensor]:
     if not match:
         raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
     return (None if match[1] is None else axis_named(match[1])), axis_named(match[2])
-
-
-def _turn(start: Tensor, end: Tensor) -> Tensor:
-    """The smallest rotation (3, 3) from one direction to another; one of many if they are opposite."""
-    cosine = float(start @ end)
-    if cosine < -1 + 1e-12:
-        side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])
-        side = side / side.norm()
-        return 2 * side[:, None] * side[None] - torch.eye(3, dtype=torch.float64)
-    cross = torch.linalg.cross(start, end)
-    x, y, z = cross.tolist()
-    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)

@@ -148,3 +148,16 @@ def curve_keys(cells: Tensor, offset: float = 0.0) -> Tensor:
     """Morton codes (N,) int64 of points (N, 3) in the unit cube, shifted by ``offset`` along each axis."""
     grid = (cells.T + offset).clamp_(0, 1).mul_(2**20 - 1).long()  # 60 of the 63 bits in a key
     return interleave(*(spread_bits(axis) for axis in grid))
+
+
+def smallest_turn(start: Tensor, end: Tensor) -> Tensor:
+    """The smallest rotation (3, 3) from one direction to another; one of many if they are opposite."""
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-12:
+        side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])
+        side = side / side.norm()
+        return 2 * side[:, None] * side[None] - torch.eye(3, dtype=torch.float64)
+    cross = torch.linalg.cross(start, end)
+    x, y, z = cross.tolist()
+    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)

@@ -77,7 +77,7 @@ class FlightFrame:
             "views": [
                 {"eye": eye, "fov": angle, **dict(zip(("right", "down", "ahead"), viewmat[:3], strict=False))}
                 for eye, angle, viewmat in zip(
-                    _eyes(self.views).tolist(), fov.tolist(), self.views.viewmats[:, :3, :3].tolist(), strict=True
+                    eyes_of(self.views).tolist(), fov.tolist(), self.views.viewmats[:, :3, :3].tolist(), strict=True
                 )
             ],
             "aspect": self.views.width / self.views.height,
@@ -90,7 +90,7 @@ class FlightFrame:
         }
 
 
-def _eyes(views: Views) -> Tensor:
+def eyes_of(views: Views) -> Tensor:
     """Positions (C, 3) of cameras."""
     return -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
 

@@ -152,7 +152,7 @@ def load_native(source: Path) -> ctypes.CDLL:
     texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")), *sorted(_SHARED.glob("*.h")))]
     key = hashlib.sha256(b"\0".join([*texts, macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
     name = f"{source.stem}-{key.hexdigest()[:20]}.so"
-    folder = _cache_folder()
+    folder = cache_folder()
     with contextlib.ExitStack() as stack:
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pointsplat-")))
@@ -207,7 +207,7 @@ def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
         raise NativeCodeError(f"{arguments[0]}: {_first_line(str(error))}") from error
 
 
-def _cache_folder() -> Path | None:
+def cache_folder() -> Path | None:
     """The folder for built libraries, which is the user's alone: that of the environment variable POINTSPLAT_CACHE, by
     default pointsplat_ns in the user's cache folder. None if there is none."""
     named = os.environ.get("POINTSPLAT_CACHE")

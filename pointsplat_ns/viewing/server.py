@@ -14,11 +14,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.formats import FORMATS
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".ckpt")
 """Ends of the names of files that may be dropped."""
@@ -47,6 +50,8 @@ class Answer:
     kind: str = "text/plain; charset=utf-8"
     status: http.HTTPStatus = http.HTTPStatus.OK
     headers: Mapping[str, str] = field(default_factory=dict)
+    file: Path | None = None
+    """A file that is sent in pieces, in place of the body."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +131,32 @@ def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | No
     return None
 
 
+class Served:
+    """What a server shows until it is closed; also the context of a ``with`` block."""
+
+    url: str
+    """Address of the page."""
+
+    @property
+    def origin(self) -> str:
+        """Text on the origin of the first view; empty without a scene."""
+        return ""
+
+    def wait(self) -> None:
+        """Wait until Ctrl-C."""
+        threading.Event().wait()
+
+    def close(self) -> None:
+        """End the server and all drawing. A second call does nothing."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     timeout = 30  # s without a byte from a client, after which its connection is closed
@@ -143,10 +174,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _serve(self) -> None:
         self.close_connection = True  # unless the whole body is read
         answer = self._answer()
+        try:
+            content = io.BytesIO(answer.body) if answer.file is None else answer.file.open("rb")
+        except OSError:
+            answer, content = Answer(status=http.HTTPStatus.NOT_FOUND), io.BytesIO()
+        with content:
+            self._send(answer, content)
+
+    def _send(self, answer: Answer, content: BinaryIO) -> None:
+        length = content.seek(0, io.SEEK_END)
+        content.seek(0)
         self.send_response(answer.status)
         headers = {
             "Content-Type": answer.kind,
-            "Content-Length": str(len(answer.body)),
+            "Content-Length": str(length),
             "Cache-Control": "no-store",
             "X-Content-Type-Options": "nosniff",
             "X-Frame-Options": "DENY",
@@ -158,7 +199,7 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(answer.body)
+        shutil.copyfileobj(content, self.wfile, 1 << 20)
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)

@@ -27,7 +27,7 @@ from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
 from pointsplat_ns.viewing.selection import Selection
-from pointsplat_ns.viewing.server import READABLE_NAMES, Answer, Request, Route, Server, received
+from pointsplat_ns.viewing.server import READABLE_NAMES, Answer, Request, Route, Served, Server, received
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class _Stage:
             selection.close(timeout)
 
 
-class Viewer:
+class Viewer(Served):
     """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
     ``with`` block.
 
@@ -178,16 +178,11 @@ class Viewer:
             self._show(scenes)
         self._server = Server(host, port, routes)
         self.url = self._server.url
-        """Address of the page."""
 
     @property
     def origin(self) -> str:
         """Text on the origin of the first view; empty without a scene."""
         return "" if self._stage is None else self._stage.origin
-
-    def wait(self) -> None:
-        """Wait until Ctrl-C."""
-        threading.Event().wait()
 
     def close(self) -> None:
         """End the server and all drawing. A second call does nothing."""
@@ -201,12 +196,6 @@ class Viewer:
             watcher.close(VIEWER.end_seconds)
         if self._stage is not None:
             self._stage.close(VIEWER.end_seconds)
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _show(self, scenes: Sequence[ViewedScene]) -> None:
         number = 1 if self._stage is None else self._stage.number + 1

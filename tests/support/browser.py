@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,10 @@ if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+SECONDS = 90
+"""How long a test waits for what shall come; it takes a few on an idle machine."""
 
 
 @contextmanager
@@ -58,3 +63,13 @@ def phone_and_colours(browser) -> tuple[int, list[str]]:
         return width, colors
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def waited(found: Callable[[], object], what: str):
+    """What a function gives once it is true."""
+    end = time.monotonic() + SECONDS
+    while time.monotonic() < end:
+        if value := found():
+            return value
+        time.sleep(0.1)
+    pytest.fail(f"{what}: not within {SECONDS} seconds")

@@ -7,8 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ import torch
 from PIL import Image
 
 import pointsplat_ns as ps
-from browser import chromium, complaints, phone_and_colours
+from browser import SECONDS, chromium, complaints, phone_and_colours, waited
 from making import REPOSITORY
 from pointsplat_ns.looking.upright import Up
 
@@ -31,19 +30,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored in the
 from pointsplat_ns.cli import main
 main(sys.argv[1:])
 """
-
-SECONDS = 90
-"""How long a test waits for what shall come; it takes a few on an idle machine."""
-
-
-def waited(found: Callable[[], object], what: str):
-    """What a function gives once it is true."""
-    end = time.monotonic() + SECONDS
-    while time.monotonic() < end:
-        if value := found():
-            return value
-        time.sleep(0.1)
-    pytest.fail(f"{what}: not within {SECONDS} seconds")
 
 
 @pytest.fixture(scope="module")

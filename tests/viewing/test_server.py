@@ -1,7 +1,6 @@
 """The viewer answers its own pages, and nobody else."""
 
 import html
-import http.client
 import json
 import socket
 import struct
@@ -23,6 +22,7 @@ from pointsplat_ns.viewing import server
 from pointsplat_ns.viewing import viewer as viewing
 from pointsplat_ns.viewing.server import LOCAL, refusal
 from pointsplat_ns.viewing.viewer import Viewer
+from serving import answer
 
 CLIENT = "a page of the tests"
 
@@ -37,19 +37,6 @@ def viewer() -> Iterator[Viewer]:
 def empty() -> Iterator[Viewer]:
     with ps.open_viewer(port=0) as opened:
         yield opened
-
-
-def answer(viewer: Viewer, method: str, path: str, body: bytes | None = None, **headers: str):
-    """What the server says to a request that any program may send: status, body and headers."""
-    host = viewer.url.removeprefix("http://")
-    connection = http.client.HTTPConnection(host, timeout=30)
-    connection.putrequest(method, path, skip_host="Host" in headers)
-    length = {} if body is None or "Content_Length" in headers else {"Content-Length": str(len(body))}
-    for name, value in {**length, **headers}.items():
-        connection.putheader(name.replace("_", "-"), value)
-    connection.endheaders(body)
-    response = connection.getresponse()
-    return response.status, response.read(), dict(response.getheaders())
 
 
 def post(viewer: Viewer, path: str, body: bytes, **headers: str):
