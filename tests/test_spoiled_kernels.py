@@ -7,7 +7,7 @@ import torch
 
 from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
-from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
+from pointsplat_ns.pruning.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import Kernels
@@ -44,6 +44,7 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
         pytest.param(tiles, "tile_to(y + half_y,", "tile_to(y - half_y,", 1, id="a box"),
         pytest.param(blending, "weights[k] += drawn ? alpha * t", "weights[k] += drawn ? t", 1, id="visible pixels"),
         pytest.param(neighbours, "dx * dx + dy * dy", "dx * dx + dy", 1, id="a distance"),
+        pytest.param(covariance, "2 * (x * y - w * z)", "2 * (x * y)", 1, id="a rotation"),
         pytest.param(pair_cost, "ik = wi * ii + wj * ij", "ik = wi * ii", 1, id="a cost"),
         pytest.param(matching, "j > i ? (cost", "j < i ? (cost", 1, id="a pair"),
         pytest.param(replacement, "wj * sj.xy + both * (apart.x * apart.y)", "wj * sj.xy", 1, id="a covariance"),

@@ -47,7 +47,7 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     near = other_neighbours(state.means, MERGING.neighbours)
     costs = pair_costs(state, near)
     first, second = cheapest_pairs(near, costs, int(MERGING.round_share * len(state)))
-    members, count = Members.of(scene, participants.members), count_of(KEEP, len(state))
+    members, count = Members(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = group_moments(members, group, count)
     parts: dict[str, Part] = {

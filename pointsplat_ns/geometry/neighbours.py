@@ -5,14 +5,19 @@ Both are exact, in float64. They may differ in the order of neighbours at equal 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.threads import most_threads
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -106,30 +111,42 @@ def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return near, torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
 
 
-def nearest_of(points: Tensor, queries: Tensor, near: Tensor, k: int, compiled: bool | None = None) -> Tensor:
+class NearestOf:
     """The nearest points of other places.
 
     Args:
         points: (N, 3) float64, finite, on the CPU; N is at least 1.
-        queries: (m, 3) likewise.
-        near: (m,) int64, for each query the index of a point; the nearer, the faster.
         k: number of neighbours.
         compiled: as for :func:`other_neighbours`.
-
-    Returns:
-        Indices (m, min(k, N)) int32, the nearest first.
     """
-    k = min(k, len(points))
-    if k <= TREE.most_compiled and KERNELS.usable(compiled):
-        return PointTree(points).nearest(queries, near, k)
-    from scipy.spatial import cKDTree
 
-    tree = cKDTree(points.numpy(), balanced_tree=False)
-    found = torch.empty(len(queries), k, dtype=torch.int32)
-    for rows in torch.arange(len(queries)).split(TREE.queries_at_once):
-        indices = tree.query(queries[rows].numpy(), k=list(range(1, k + 1)), workers=most_threads())[1]
-        found[rows] = torch.from_numpy(indices).to(torch.int32)
-    return found
+    def __init__(self, points: Tensor, k: int, compiled: bool | None = None):
+        self._k, self._points = min(k, len(points)), points
+        suited = self._k <= TREE.most_compiled and KERNELS.usable(compiled)
+        self._tree = PointTree(points) if suited else None
+
+    def __call__(self, queries: Tensor, near: Tensor) -> Tensor:
+        """The nearest points of some places.
+
+        Args:
+            queries: (m, 3) float64, finite, on the CPU.
+            near: (m,) int64, for each query the index of a point; the nearer, the faster.
+
+        Returns:
+            Indices (m, min(k, N)) int32, the nearest first.
+        """
+        if self._tree is not None:
+            return self._tree.nearest(queries, near, self._k)
+        ranks = list(range(1, self._k + 1))
+        return torch.from_numpy(self._by_scipy.query(queries.numpy(), k=ranks, workers=most_threads())[1]).to(
+            torch.int32
+        )
+
+    @functools.cached_property
+    def _by_scipy(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self._points.numpy(), balanced_tree=False)
 
 
 class PointTree:
@@ -164,10 +181,15 @@ class PointTree:
         return self._search(len(self.order), k)
 
     def nearest(self, queries: Tensor, near: Tensor, k: int) -> Tensor:
-        """As :func:`nearest_of`, for at most ``TREE.most_compiled`` neighbours."""
+        """As :class:`NearestOf`, for at most ``TREE.most_compiled`` neighbours."""
+        return self._search(len(queries), k, queries=queries.contiguous(), leaves=self._leaves[near])
+
+    @functools.cached_property
+    def _leaves(self) -> Tensor:
+        """The leaf (N,) int64 of each point."""
         leaves = torch.empty_like(self.order)
         leaves[self.order] = torch.arange(len(self.order)) // TREE.lanes
-        return self._search(len(queries), k, queries=queries.contiguous(), leaves=leaves[near])
+        return leaves
 
     def _search(self, count: int, k: int, **where: Tensor) -> Tensor:
         found = torch.empty(count, k, dtype=torch.int32)

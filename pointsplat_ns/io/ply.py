@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,10 +56,12 @@ def read_ply(path: Path | str) -> Gaussians:
         k = min(in_file, MAX_REST)
         require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
         _report_unread(header, vertex, in_file, path)
-        with _GaussiansAlone(path, header) as stream:
-            # Binary rows are mapped, not read: only the Gaussians below take memory.
-            rows = PlyData.read(stream, mmap="r")["vertex"].data
-            scene = _scene(rows, k, in_file, is_antialiased(header, path))
+        if header.order:
+            scene = PlyRows.of(path, header, vertex, in_file).read(0, vertex.count)
+        else:
+            with _GaussiansAlone(path, header) as stream:
+                rows = PlyData.read(stream)["vertex"].data
+            scene = _scene(len(rows), lambda these: rows[these], k, in_file, is_antialiased(header, path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -95,6 +98,11 @@ class PlyRows:
             return None
         if warn:
             _report_unread(header, vertex, in_file, path)
+        return cls.of(path, header, vertex, in_file)
+
+    @classmethod
+    def of(cls, path: Path, header: Header, vertex: Element, in_file: int) -> PlyRows:
+        """The rows of a file with what :func:`_checked` found in it."""
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
         return cls(path, vertex.count, min(in_file, MAX_REST), is_antialiased(header, path), dtype, start, in_file)
@@ -110,26 +118,41 @@ class PlyRows:
     def read(self, start: int, stop: int) -> Gaussians:
         """The Gaussians of rows ``start`` to ``stop`` - 1, float32, those that cannot be drawn included. Raises
         SceneError if the file cannot be read or has become shorter."""
-        return self._of([(start, stop - start)])
+        size = self._dtype.itemsize
+        with self._opened() as stream:
+            stream.seek(self._start + start * size)
+            return self._scene(stop - start, lambda these: stream.read((these.stop - these.start) * size))
 
     def pick(self, rows: Sequence[int]) -> Gaussians:
         """The Gaussians of single rows, as :meth:`read` gives them."""
-        return self._of([(row, 1) for row in rows])
+        size = self._dtype.itemsize
 
-    def _of(self, parts: Sequence[tuple[int, int]]) -> Gaussians:
-        """The Gaussians of parts of the file: first row, and number of rows."""
-        size, found = self._dtype.itemsize, []
+        def row(number: int, stream: io.BufferedReader) -> bytes:
+            stream.seek(self._start + number * size)
+            return stream.read(size)
+
+        with self._opened() as stream:
+            return self._scene(len(rows), lambda these: b"".join(row(number, stream) for number in rows[these]))
+
+    @contextmanager
+    def _opened(self) -> Iterator[io.BufferedReader]:
+        """The file, open. Raises SceneError if it cannot be read."""
         try:
             with self.path.open("rb") as stream:
-                for start, count in parts:
-                    stream.seek(self._start + start * size)
-                    found.append(stream.read(count * size))
+                yield stream
         except OSError as error:
             raise SceneError(f"{self.path}: cannot be read ({error.strerror or one_line(error)})") from error
-        data = b"".join(found) if len(found) > 1 else found[0]
-        if len(data) < size * sum(count for _, count in parts):
-            raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
-        return _scene(np.frombuffer(data, self._dtype), self.rest, self._in_file, self.antialiased)
+
+    def _scene(self, count: int, bytes_of: Callable[[slice], bytes]) -> Gaussians:
+        """The Gaussians of ``count`` rows, of which ``bytes_of`` gives those of a slice."""
+
+        def rows_of(these: slice) -> np.ndarray:
+            data = bytes_of(these)
+            if len(data) < self._dtype.itemsize * (these.stop - these.start):
+                raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
+            return np.frombuffer(data, self._dtype)
+
+        return _scene(count, rows_of, self.rest, self._in_file, self.antialiased)
 
 
 def _checked(path: Path) -> tuple[Header, Element, int]:
@@ -278,29 +301,30 @@ def _num_rest(vertex: Element, path: Path) -> int:
     return len(rest) // 3
 
 
-def _scene(rows: np.ndarray, k: int, in_file: int, antialiased: bool) -> Gaussians:
-    """The scene in structured rows (N,), with ``k`` coefficients per channel beyond the constant one, of ``in_file``
-    that the file has."""
+def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: int, antialiased: bool) -> Gaussians:
+    """The scene in ``count`` structured rows, of which ``rows_of`` gives those of a slice, with ``k`` coefficients per
+    channel beyond the constant one, of ``in_file`` that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
-    flat = _is_flat(rows.dtype.names or ())
+    flat = _is_flat(rows_of(slice(0, 0)).dtype.names or ())
     columns = {
         **{name: _COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
         # Channel-major in the file, channel last in a scene.
         "scales": _COLUMNS["scales"][: 2 if flat else 3],
         "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }
-    tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
+    tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
     at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
     # A double beyond float32 becomes Inf and is dropped with the others.
     with np.errstate(over="ignore"):
-        for start in range(0, len(rows), at_once):
-            chunk = slice(start, start + at_once)
+        for start in range(0, count, at_once):
+            chunk = slice(start, min(start + at_once, count))
+            rows = rows_of(chunk)
             for name, fields in columns.items():
                 if fields:
-                    tables[name][chunk] = structured_to_unstructured(rows[chunk][fields], np.float32)
+                    tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
     if flat:
-        tables["scales"] = np.column_stack([tables["scales"], np.full(len(rows), -np.inf, np.float32)])
+        tables["scales"] = np.column_stack([tables["scales"], np.full(count, -np.inf, np.float32)])
     tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
-    tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), k, 3)
+    tensors["features_rest"] = tensors["features_rest"].reshape(count, k, 3)
     return Gaussians(**tensors, antialiased=antialiased)

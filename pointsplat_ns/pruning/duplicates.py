@@ -23,7 +23,7 @@ class Reduced:
 
     scene: Gaussians
     members: Tensor  # [m] ascending indices in ``scene`` of the members that are left
-    index: Tensor  # [N] index in ``scene`` of the Gaussian that each of the original became
+    index: Tensor | None  # [N] index in ``scene`` of the Gaussian that each of the original became; None: its own
 
 
 class Copies:
@@ -47,10 +47,9 @@ class Copies:
         """The scene with ``k`` of the members, at least :attr:`distinct` and at most n. Of each kind, the last copies
         are removed, and the first one is changed so that it looks like itself and the removed ones together."""
         n = len(self)
-        index = torch.arange(len(self.scene))
         if k == n:
-            return Reduced(self.scene, self.members, index)
-        rank = _ranks(self.first)
+            return Reduced(self.scene, self.members, None)
+        index, rank = torch.arange(len(self.scene)), _ranks(self.first)
         removed = torch.ones(n, dtype=torch.bool)
         removed[rank.sort(stable=True).indices[:k]] = False
         counts = torch.bincount(self.first[removed], minlength=n) + 1

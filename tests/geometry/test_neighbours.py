@@ -5,7 +5,7 @@ import torch
 
 from making import assert_same_on_any_threads
 from pointsplat_ns.geometry import neighbours
-from pointsplat_ns.geometry.neighbours import KERNELS, PointTree, nearest, nearest_of, other_neighbours
+from pointsplat_ns.geometry.neighbours import KERNELS, NearestOf, PointTree, nearest, other_neighbours
 from pointsplat_ns.geometry.transforms import curve_keys
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
@@ -57,7 +57,7 @@ def test_the_nearest_of_other_places_are_those_of_brute_force(n, compiled):
     where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
     where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
     queries = where + 0.2 * points(n, seed=1).double()
-    near = nearest_of(where, queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)), 6, compiled)
+    near = NearestOf(where, 6, compiled)(queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)))
     distances = (queries[:, None] - where[near.long()]).square().sum(2)
     wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :6]
     torch.testing.assert_close(distances, wanted, rtol=1e-14, atol=0)  # float64, in another order

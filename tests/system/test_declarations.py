@@ -11,7 +11,7 @@ import torch
 import pointsplat_ns
 from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
-from pointsplat_ns.pruning.merging import matching, pair_cost, regrouping, replacement
+from pointsplat_ns.pruning.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import functions_of, structs_of
@@ -45,7 +45,7 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 }  // extern "C"
 """
 MODULES = (blending, colors, pictures, projection, tiles, structural_similarity)
-MERGING = (neighbours, matching, pair_cost, regrouping, replacement)
+MERGING = (neighbours, covariance, matching, pair_cost, regrouping, replacement)
 KERNELS = [module.KERNELS for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 

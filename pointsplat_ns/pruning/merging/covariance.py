@@ -7,11 +7,16 @@ A symmetric 3 x 3 matrix is stored as its six numbers (xx, xy, xz, yy, yz, zz), 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
+from pointsplat_ns.system.pieces import in_pieces
+from pointsplat_ns.system.threads import most_threads
 
 MIN_DIVISOR = 1e-300
 """Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""
@@ -26,9 +31,11 @@ def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
     return pack(axes @ axes.transpose(1, 2))
 
 
-def covariances_of(scene: Gaussians, rows: Tensor) -> Tensor:
-    """Covariances (m, 6) of the Gaussians ``rows`` (m,) of a scene, float64."""
-    return covariances(scene.scales[rows].double(), scene.quats[rows].double())
+def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None) -> Tensor:
+    """:func:`covariances` (m, 6) of the Gaussians ``rows`` (m,) of a scene; ``compiled`` False leaves it to torch."""
+    if KERNELS.usable_for(compiled, scene.scales, scene.quats):
+        return _by_kernels(scene.scales, scene.quats, rows)
+    return in_pieces(lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()), rows, 6)
 
 
 def pack(matrix: Tensor) -> Tensor:
@@ -124,3 +131,23 @@ def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
     distance = (both[:, 2] * u * u - 2 * both[:, 1] * u * v + both[:, 0] * v * v) / area / area
     large, small = (order(projected_area(first), projected_area(second)) for order in (torch.maximum, torch.minimum))
     return small * (large / area).clamp_max(1) * torch.exp(-0.5 * distance.clamp_min(0))
+
+
+def _by_kernels(log_scales: Tensor, quats: Tensor, rows: Tensor) -> Tensor:
+    """As :func:`covariances`, (m, 6), for the rows (m,) of float32 log-scales and quaternions."""
+    cov = torch.empty(len(rows), 6, dtype=torch.float64)
+    task = KERNELS.structs["Shapes"](
+        log_scales=log_scales.contiguous(), quats=quats.contiguous(), rows=rows.contiguous(), count=len(rows), cov=cov
+    )
+    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task, threads=most_threads())
+    return cov
+
+
+def _as_torch() -> bool:
+    """Whether the kernel computes the covariances of some Gaussians as torch does."""
+    log_scales, quats = torch.randn(90, 7, generator=torch.Generator().manual_seed(0)).split([3, 4], dim=1)
+    torchs = covariances(log_scales[::2].double(), quats[::2].double())
+    return torch.allclose(_by_kernels(log_scales, quats, torch.arange(0, 90, 2)), torchs, rtol=1e-9)
+
+
+KERNELS = Kernels("merging", Path(__file__).with_name("covariance.cpp"), _as_torch)

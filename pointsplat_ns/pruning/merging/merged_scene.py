@@ -23,23 +23,18 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
     scene, counts = participants.scene, groups.counts.double()
     single = (counts == 1)[:, None]
     sh = _mean_sh(participants, groups, single[:, 0])
-    log_scales, quats = _axes(groups.cov)
+    log_scales, quats = _axes(groups.cov, scene.dtype)
     means = torch.where(single, scene.means[groups.first], groups.means.to(scene.dtype))
-    quats = torch.where(single, scene.quats[groups.first], quats.to(scene.dtype))
+    quats = torch.where(single, scene.quats[groups.first], quats)
 
     alphas = deepened(groups.alphas, counts, settings.depth_exponent, settings.max_opacity)
     logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
 
+    own_scales, opacities = scene.scales[groups.first], torch.where(single, scene.opacities[groups.first], logits)
+
     def make(size_change: float) -> Gaussians:
-        sizes = (log_scales + size_change).to(scene.dtype)
-        return Gaussians(
-            means,
-            torch.where(single, scene.scales[groups.first], sizes),
-            quats,
-            torch.where(single, scene.opacities[groups.first], logits),
-            *sh,
-            antialiased=scene.antialiased,
-        )
+        scales = torch.where(single, own_scales, (log_scales + size_change).to(scene.dtype))
+        return Gaussians(means, scales, quats, opacities, *sh, antialiased=scene.antialiased)
 
     return make
 
@@ -68,12 +63,12 @@ def _mean_sh(participants: Participants, groups: Groups, single: Tensor) -> tupl
     return means[0], means[1]
 
 
-def _axes(cov: Tensor) -> tuple[Tensor, Tensor]:
-    """Log-scales (n, 3) and quaternions (n, 4) of covariances (n, 6)."""
-    scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=torch.float64)
+def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
+    scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=dtype)
     for rows in torch.arange(len(cov)).split(CHUNK):
         variances, axes = torch.linalg.eigh(unpack(cov[rows]))
         axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
         scales[rows] = 0.5 * variances.clamp_min(MIN_DIVISOR).log()
-        quats[rows] = quaternions_of(axes)
+        quats[rows] = quaternions_of(axes).to(dtype)
     return scales, quats

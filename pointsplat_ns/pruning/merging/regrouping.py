@@ -14,15 +14,17 @@ kernel (``regrouping.cpp``) compares groups, or torch.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.neighbours import nearest_of
-from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, covariances_of, outer, rms_area, unpack
+from pointsplat_ns.geometry.neighbours import NearestOf
+from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
 from pointsplat_ns.pruning.merging.groups import Groups, first_members
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.replacement import enlarged
@@ -30,49 +32,78 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import bounded_colours
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
-from pointsplat_ns.system.threads import in_threads, most_threads
+from pointsplat_ns.system.threads import most_threads
 
 
-@dataclass(frozen=True, eq=False)
 class Members:
-    """n members of groups, in the numbers that regrouping needs."""
+    """n members of groups. Of their numbers, only masses are kept: the others are computed in pieces each time, which
+    takes less memory and, by the kernel, little time.
 
-    means: Tensor  # [n, 3] float64, scene units
-    cov: Tensor  # [n, 6] float64, squared scene units
-    masses: Tensor  # [n] float64, opacity times root mean square area
-    colours: Tensor  # [n, 3] float32 of SH degree 0, colour units
+    Args:
+        scene: N Gaussians on the CPU.
+        rows: (n,) indices of the members in it.
+        settings: ``max_colour``.
+    """
 
-    @classmethod
-    def of(cls, scene: Gaussians, rows: Tensor, settings: MergeSettings = MERGING) -> Members:
-        """The Gaussians ``rows`` (n,) of a scene on the CPU."""
-        cov = in_pieces(lambda these: covariances_of(scene, these), rows, 6)
-
-        def masses(these: Tensor) -> Tensor:
-            return torch.sigmoid(scene.opacities[rows[these], 0].double()) * rms_area(cov[these])
-
-        return cls(
-            scene.means[rows].double(),
-            cov,
-            in_pieces(masses, torch.arange(len(rows))),
-            bounded_colours(scene.features_dc[rows], settings),
-        )
+    def __init__(self, scene: Gaussians, rows: Tensor, settings: MergeSettings = MERGING):
+        self._scene, self._rows, self._settings = scene, rows, settings
+        self.masses = torch.empty(len(rows), dtype=torch.float64)
+        """Opacity times root mean square area, (n,)."""
+        for these in self.pieces():
+            some = rows[these]
+            alphas = torch.sigmoid(scene.opacities[some, 0].double())
+            self.masses[these] = alphas * rms_area(covariances_of(scene, some))
 
     def __len__(self) -> int:
-        return len(self.means)
+        return len(self._rows)
+
+    def pieces(self) -> Iterator[slice]:
+        """All members, in pieces."""
+        return (slice(first, first + CHUNK) for first in range(0, len(self), CHUNK))
+
+    def means(self, these: slice) -> Tensor:
+        """Means (m, 3) float64 of a piece, scene units."""
+        return self._scene.means[self._rows[these]].double()
+
+    def cov(self, these: slice) -> Tensor:
+        """Covariances (m, 6) float64 of a piece, squared scene units."""
+        return covariances_of(self._scene, self._rows[these])
+
+    def colours(self, these: slice) -> Tensor:
+        """Colours (m, 3) float32 of SH degree 0 of a piece, colour units."""
+        return bounded_colours(self._scene.features_dc[self._rows[these]], self._settings)
+
+    def __getitem__(self, these: slice) -> Piece:
+        return Piece(self.means(these), self.cov(these), self.colours(these))
+
+
+class Piece(NamedTuple):
+    """m members, in the numbers by which they choose."""
+
+    means: Tensor  # [m, 3] float64, scene units
+    cov: Tensor  # [m, 6] float64, squared scene units
+    colours: Tensor  # [m, 3] float32 of SH degree 0, colour units
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Moments of K groups of n members, weighted by mass."""
+    """Moments of K groups, weighted by mass."""
 
     mass: Tensor  # [K] float64
+    sizes: Tensor  # [K] int64, number of members
     means: Tensor  # [K, 3] float64
     cov: Tensor  # [K, 6] float64, mean covariance of the members, and covariance of their means
     colours: Tensor  # [K, 3] float64, of SH degree 0
-    shares: Tensor  # [n] float64, of the members in the mass of their groups
+
+    def shares(self, masses: Tensor, group: Tensor) -> Tensor:
+        """Shares (m,) float64 of members with masses (m,) in the mass of their groups (m,)."""
+        total = self.mass[group]
+        return torch.where(total > MIN_DIVISOR, masses / total.clamp_min(MIN_DIVISOR), 1 / self.sizes[group])
 
 
-def regrouped(participants: Participants, groups: Groups, settings: MergeSettings) -> Groups:
+def regrouped(
+    participants: Participants, group: Tensor, areas: Tensor, alphas: Tensor, settings: MergeSettings
+) -> Groups:
     """Groups whose members fit them better.
 
     The mass of a group may differ from the sum of its members' masses, because members overlap. The ratio of both is
@@ -80,30 +111,36 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
 
     Args:
         participants: n Gaussians.
-        groups: K groups of them.
+        group: (n,) the group of each, of K.
+        areas, alphas: (K,) float64 root mean square area and opacity of the groups.
         settings: ``regrouping_rounds`` and how members choose.
     """
-    members = Members.of(participants.scene, participants.members, settings)
-    group, count = groups.group, len(groups)
+    members, count = Members(participants.scene, participants.members, settings), len(alphas)
     common = group_moments(members, group, count)
-    ratios = groups.alphas * rms_area(groups.cov) / common.mass.clamp_min(MIN_DIVISOR)
+    ratios = alphas * areas / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):
         group = best_groups(members, group, common, settings)
         common = group_moments(members, group, count)
     alphas = torch.where(
-        common.mass > MIN_DIVISOR,
-        ratios * common.mass / rms_area(common.cov).clamp_min(MIN_DIVISOR),
-        groups.alphas,
+        common.mass > MIN_DIVISOR, ratios * common.mass / areas_of(common.cov).clamp_min(MIN_DIVISOR), alphas
+    )
+    shares = in_pieces(
+        lambda these: common.shares(members.masses[these], group[these]), torch.arange(len(group)), dtype=torch.float32
     )
     return Groups(
         group,
-        common.shares.float(),
+        shares,
         first_members(participants, group, count),
         common.means,
         enlarged(common.cov, alphas, settings),
         alphas.clamp_max(settings.max_opacity),
-        torch.bincount(group, minlength=count).to(torch.int32),
+        common.sizes.to(torch.int32),
     )
+
+
+def areas_of(cov: Tensor) -> Tensor:
+    """Root mean square areas (K,) of covariances (K, 6), computed in pieces."""
+    return in_pieces(lambda these: rms_area(cov[these]), torch.arange(len(cov)))
 
 
 def group_moments(members: Members, group: Tensor, count: int) -> Moments:
@@ -114,25 +151,22 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
         group: (n,) the group of each.
         count: number of groups, K; each has a member.
     """
-    pieces = torch.arange(len(members)).split(CHUNK)
 
     def zeros(*shape: int) -> Tensor:
         return torch.zeros(count, *shape, dtype=torch.float64)
 
     mass, sizes = zeros().index_add_(0, group, members.masses), torch.bincount(group, minlength=count)
-    shares = torch.empty_like(members.masses)
-    means, colours, cov = zeros(3), zeros(3), zeros(6)
-    for rows in pieces:
-        own = group[rows]
-        total, masses = mass[own], members.masses[rows]
-        shares[rows] = torch.where(total > MIN_DIVISOR, masses / total.clamp_min(MIN_DIVISOR), 1 / sizes[own])
-        share = shares[rows, None]
-        means.index_add_(0, own, share * members.means[rows])
-        colours.index_add_(0, own, share * members.colours[rows])
-    for rows in pieces:
-        apart = members.means[rows] - means[group[rows]]
-        cov.index_add_(0, group[rows], shares[rows, None] * (members.cov[rows] + outer(apart)))
-    return Moments(mass, means, cov, colours, shares)
+    found = Moments(mass, sizes, zeros(3), zeros(6), zeros(3))
+    for these in members.pieces():
+        own = group[these]
+        share = found.shares(members.masses[these], own)[:, None]
+        found.means.index_add_(0, own, share * members.means(these))
+        found.colours.index_add_(0, own, share * members.colours(these))
+    for these in members.pieces():
+        own = group[these]
+        share = found.shares(members.masses[these], own)[:, None]
+        found.cov.index_add_(0, own, share * (members.cov(these) + outer(members.means(these) - found.means[own])))
+    return found
 
 
 def best_groups(
@@ -152,25 +186,16 @@ def best_groups(
         settings: ``regrouping_candidates`` and ``regrouping_contrast``.
         compiled: False leaves it to scipy and torch; True warns if the kernels could not be compiled.
     """
-    count = len(groups.mass)
-    variance = (groups.cov[:, (0, 3, 5)].mean(1)).clamp_min(MIN_DIVISOR)
-    shapes = unpack(groups.cov / variance[:, None]) + 1e-6 * torch.eye(3, dtype=torch.float64)  # invertible if flat
-    inverse = torch.linalg.inv(shapes)
-    occurrences = inverse.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the six numbers of a symmetric matrix
-    inverse = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)] * (occurrences / variance[:, None])
-    log_determinants = torch.logdet(shapes) + 3 * variance.log()
-    fits = Fits(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
-    near = nearest_of(groups.means, members.means, group, settings.regrouping_candidates, compiled)
-    if KERNELS.usable(compiled):
-        result = _by_kernels(members, group, near, fits)
-    else:
-        result = torch.empty_like(group)
-
-        def choose(rows: Tensor) -> None:
-            result[rows] = fits.best_of(members, rows, torch.cat([group[rows, None], near[rows].long()], dim=1))
-
-        in_threads(choose, torch.arange(len(members)).split(CHUNK // 4))  # each is compared with several groups
-    heaviest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, group, members.masses, "amax")
+    result = torch.empty_like(group)
+    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, settings.regrouping_candidates, compiled)
+    for these in members.pieces():
+        piece, own = members[these], group[these]
+        near = nearest(piece.means, own)
+        if KERNELS.usable(compiled):
+            result[these] = _by_kernels(piece, own, near, fits)
+        else:
+            result[these] = fits.best_of(piece, torch.cat([own[:, None], near.long()], dim=1))
+    heaviest = torch.zeros(len(groups.mass), dtype=torch.float64).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
 
 
@@ -185,23 +210,36 @@ class Fits:
     colour_weight: float
     """Weight of the squared difference of colours."""
 
-    def best_of(self, members: Members, rows: Tensor, candidates: Tensor) -> Tensor:
-        """The candidate that each member of ``rows`` (m,) fits best, groups (m, c) int64; the first of equals."""
-        apart = members.means[rows, None] - self.means[candidates]
-        second = members.cov[rows, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
+    @classmethod
+    def of(cls, groups: Moments, settings: MergeSettings) -> Fits:
+        """The groups with some moments."""
+        inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
+        occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
+        for these in torch.arange(len(groups.mass)).split(CHUNK):
+            cov = groups.cov[these]
+            variance = cov[:, (0, 3, 5)].mean(1).clamp_min(MIN_DIVISOR)
+            shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, dtype=torch.float64)  # invertible if flat
+            inverse[these] = pack(torch.linalg.inv(shapes)) * (occurrences / variance[:, None])
+            log_determinants[these] = torch.logdet(shapes) + 3 * variance.log()
+        return cls(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
+
+    def best_of(self, piece: Piece, candidates: Tensor) -> Tensor:
+        """The candidate that each of m members fits best, of groups (m, c) int64; the first of equals."""
+        apart = piece.means[:, None] - self.means[candidates]
+        second = piece.cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
         fit = 0.5 * ((second * self.inverse[candidates]).sum(2) + self.log_determinants[candidates])
-        contrast = members.colours[rows, None] - self.colours[candidates]
+        contrast = piece.colours[:, None] - self.colours[candidates]
         fit += contrast.square().sum(2) * self.colour_weight
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)
         return candidates.gather(1, best)[:, 0]
 
 
-def _by_kernels(members: Members, group: Tensor, near: Tensor, fits: Fits) -> Tensor:
-    """As :meth:`Fits.best_of` for all members, each with its own group (n,) and the nearest (n, k) int32."""
+def _by_kernels(piece: Piece, group: Tensor, near: Tensor, fits: Fits) -> Tensor:
+    """As :meth:`Fits.best_of` for m members, each with its own group (m,) and the nearest (m, k) int32."""
     best = torch.empty_like(group)
     task = KERNELS.structs["Choice"](
-        means=members.means, cov=members.cov, colours=members.colours, group=group, near=near, count=len(group),
-        candidates=near.shape[1], group_means=fits.means, inverse=fits.inverse.contiguous(),
+        means=piece.means, cov=piece.cov, colours=piece.colours, group=group, near=near, count=len(group),
+        candidates=near.shape[1], group_means=fits.means, inverse=fits.inverse,
         log_determinants=fits.log_determinants, group_colours=fits.colours, colour_weight=fits.colour_weight, best=best,
     )  # fmt: skip
     on_threads(len(group) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
@@ -215,11 +253,11 @@ def _as_torch() -> bool:
     def random(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    members = Members(random(90, 3), random(90, 6), random(90), random(90, 3).float())
+    piece = Piece(random(90, 3), random(90, 6), random(90, 3).float())
     fits = Fits(random(9, 3), random(9, 6), random(9), random(9, 3), 2.0)
     group, near = (torch.randint(9, shape, generator=generator) for shape in ((90,), (90, 4)))
-    torchs = fits.best_of(members, torch.arange(90), torch.cat([group[:, None], near], dim=1))
-    return torch.equal(_by_kernels(members, group, near.int(), fits), torchs)
+    torchs = fits.best_of(piece, torch.cat([group[:, None], near], dim=1))
+    return torch.equal(_by_kernels(piece, group, near.int(), fits), torchs)
 
 
 KERNELS = Kernels("merging", Path(__file__).with_name("regrouping.cpp"), _as_torch)

@@ -23,12 +23,12 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
-from pointsplat_ns.pruning.merging.groups import Groups, merged_groups
+from pointsplat_ns.pruning.merging.groups import merged_groups
 from pointsplat_ns.pruning.merging.matching import cheapest_pairs
 from pointsplat_ns.pruning.merging.merged_scene import scene_maker
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.regrouping import regrouped
+from pointsplat_ns.pruning.merging.regrouping import areas_of, regrouped
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
@@ -181,34 +181,35 @@ def _levels(
     step: Step | None = None
     for k in counts:
         left = max(k, copies.distinct)
-        if step is None or left < len(step.reduced.members):
+        if step is None or left < len(step.participants):
             with one_thread_each():
                 step = first_step(copies.reduced(left), views, settings)
         while len(step.state) > k:
             with one_thread_each():
                 step = one_round(step, k, settings)
             report(0.95 * (first - len(step.state)) / max(first - last, 1))
-        merged = _result(step, scene.device, len(counts) == 1, settings)
+        merged = _result(step, scene.device, len(counts) == 1, settings, k == last)
         if k == last:
             report(1.0)
         yield merged
 
 
-def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
-    """The result after the last round, on a device."""
+def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings, last: bool = False) -> Merged:
+    """The result after some rounds, on a device; ``last`` as for :func:`finished`."""
     with one_thread_each():
-        groups, scene, finish = finished(step, regroup, settings)
-    of_reduced = torch.full((len(step.reduced.scene),), -1)
-    of_reduced[step.participants.members] = groups.group
-    assignment = of_reduced[step.reduced.index]
+        group, scene, finish = finished(step, regroup, settings, last)
+    assignment = torch.full((len(step.participants.scene),), -1)
+    assignment[step.participants.members] = group
+    if step.index is not None:
+        assignment = assignment[step.index]
     return Merged(scene.to(device), assignment.to(device), finish, step.viewpoints.views if step.viewpoints else None)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Step:
     """Everything that is known between two rounds."""
 
-    reduced: Reduced
+    index: Tensor | None  # [N] of Reduced
     participants: Participants
     viewpoints: Viewpoints | None
     state: State
@@ -234,15 +235,14 @@ def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeS
     """The step before the first round; ``views`` as for :func:`merge`."""
     participants = Participants.of(reduced.scene, reduced.members)
     viewpoints, weights = views_and_weights(participants, views, settings)
-    state = initial_state(participants, weights, settings)
-    tree = Tree.of_single(len(participants))
 
     def dense() -> Gaussians:
         whole = len(participants) == len(participants.scene)
         return participants.scene if whole else participants.scene[participants.members]
 
-    reference = _reference(participants, viewpoints, len(state), dense, settings)
-    return Step(reduced, participants, viewpoints, state, tree, reference)
+    reference = _reference(participants, viewpoints, len(participants), dense, settings)
+    state = initial_state(participants, weights, settings)
+    return Step(reduced.index, participants, viewpoints, state, Tree.of_single(len(state)), reference)
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
@@ -257,6 +257,7 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     most = min(n - k, most_pairs(n, settings))
     near = other_neighbours(step.state.means, settings.neighbours)
     first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
+    del near
     state, shares = replace_pairs(step.state, first, second, settings)
     tree = step.tree.after_round(first, second, shares)
 
@@ -268,24 +269,36 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     return replace(step, state=state, tree=tree, reference=reference)
 
 
-def finished(step: Step, regroup: bool, settings: MergeSettings) -> tuple[Groups, Gaussians, Finish]:
-    """The groups of a step, in the order of their first members, and their scene with the finish that suits it.
+def finished(
+    step: Step, regroup: bool, settings: MergeSettings, last: bool = False
+) -> tuple[Tensor, Gaussians, Finish]:
+    """The group (n,) of each participant in a step, in the order of their first members, and the scene of the groups
+    with the finish that suits it.
 
     Args:
         step: after the last round.
         regroup: whether members may change groups.
         settings: of regrouping and finishing.
+        last: whether the step is not needed any more; it loses its state and tree then, to save memory.
     """
     participants, reference = step.participants, step.reference
     groups = merged_groups(participants, step.state, step.tree)
-    if regroup and groups.any_merged and settings.regrouping_rounds > 0:
-        groups = regrouped(participants, groups, settings)
+    if last:
+        del step.state, step.tree
+    any_merged = groups.any_merged
+    if regroup and any_merged and settings.regrouping_rounds > 0:
+        group, areas, alphas = groups.group, areas_of(groups.cov), groups.alphas
+        del groups
+        groups = regrouped(participants, group, areas, alphas, settings)
+        del group
     groups = groups.in_order()
     make = scene_maker(participants, groups, settings)
+    group = groups.group
+    del groups
     finish = Finish()
-    if reference is not None and groups.any_merged:
+    if reference is not None and any_merged:
         finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))), settings)
-    return groups, make(finish.size_change), finish
+    return group, make(finish.size_change), finish
 
 
 def _reference(

@@ -55,7 +55,7 @@ def initial_state(
     scene, members = participants.scene, participants.members
     return State(
         means=scene.means[members].double(),
-        cov=in_pieces(lambda rows: covariances_of(scene, rows), members, 6),
+        cov=covariances_of(scene, members),
         alphas=torch.sigmoid(scene.opacities[members, 0]).double(),
         colours=_on_axes(scene, members, axes or principal_axes(scene, members, settings), settings),
         weights=weights.float(),

@@ -136,12 +136,12 @@ def random_groups(scene: Gaussians, count: int) -> torch.Tensor:
 
 def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
     """Moments of groups of all."""
-    return group_moments(Members.of(scene, ALL), group, count)
+    return group_moments(Members(scene, ALL), group, count)
 
 
 def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
     """The group that each fits best: the same by kernels and without them."""
-    members, groups = Members.of(scene, ALL), moments_of(scene, group, count)
+    members, groups = Members(scene, ALL), moments_of(scene, group, count)
     found, torchs = (best_groups(members, group, groups, compiled=compiled) for compiled in (None, False))
     assert torch.equal(found, torchs)
     return found
@@ -155,13 +155,13 @@ def likelihood(scene: Gaussians, group: torch.Tensor, count: int) -> float:
     log_density = torch.stack([normal.log_prob(mean[None].expand(count, 3)) for mean in scene.means.double()])
     within = (torch.linalg.inv(unpack(groups.cov))[group] * unpack(own)).sum((1, 2))
     fit = log_density.gather(1, group[:, None])[:, 0] - 0.5 * within
-    return float((fit * Members.of(scene, ALL).masses).sum() / groups.mass.sum())
+    return float((fit * Members(scene, ALL).masses).sum() / groups.mass.sum())
 
 
 def test_moments_are_those_of_the_members_and_between_them():
     scene, group = cloud(200), random_groups(cloud(200), 7)
     groups = moments_of(scene, group, 7)
-    masses = Members.of(scene, ALL).masses
+    masses = Members(scene, ALL).masses
     for number in range(7):
         these = (group == number).nonzero()[:, 0]
         weights = masses[these] / masses[these].sum()
@@ -172,7 +172,7 @@ def test_moments_are_those_of_the_members_and_between_them():
         spread = (weights[:, None, None] * (own + apart[:, :, None] * apart[:, None])).sum(0)
         torch.testing.assert_close(groups.means[number], centre)
         torch.testing.assert_close(unpack(groups.cov)[number], spread)
-        torch.testing.assert_close(groups.shares[these], weights)
+        torch.testing.assert_close(groups.shares(masses[these], group[these]), weights)
     torch.testing.assert_close(groups.mass.sum(), masses.sum())
 
 

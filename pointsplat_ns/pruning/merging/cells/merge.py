@@ -26,7 +26,7 @@ from pointsplat_ns.pruning.merging.matching import candidate_pairs
 from pointsplat_ns.pruning.merging.merged_scene import scene_maker
 from pointsplat_ns.pruning.merging.pair_cost import pair_costs
 from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.regrouping import regrouped
+from pointsplat_ns.pruning.merging.regrouping import areas_of, regrouped
 from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.rounds import merge
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
@@ -201,7 +201,7 @@ class _Work:
             groups = Groups(group, torch.ones(len(group)), first, state.means, state.cov, state.alphas, state.counts)
             del state
             if groups.any_merged:
-                groups = regrouped(participants, groups, self.settings)
+                groups = regrouped(participants, group, areas_of(groups.cov), groups.alphas, self.settings)
             row_table(scene_maker(participants, groups.in_order(), self.settings)(size_change)).tofile(path)
 
 
