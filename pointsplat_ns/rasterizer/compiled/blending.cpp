@@ -10,8 +10,9 @@
 namespace {
 
 constexpr int PIXELS = TILE * TILE;
-constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances
+constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances; a bit each
 constexpr int GRAB = 4;      // tiles that a thread takes at once
+constexpr int AHEAD = 16;    // pairs that are fetched early
 constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
 constexpr float HALF = 0.5f * (TILE - 1);
@@ -22,6 +23,7 @@ typedef Lane Row;  // of pixels
 static_assert(LANES == TILE, "a row of a tile is one vector");
 
 const Row OFFSETS = {-3.5f, -2.5f, -1.5f, -0.5f, 0.5f, 1.5f, 2.5f, 3.5f};  // of pixels from the tile's centre
+const Mask BITS = {1, 2, 4, 8, 16, 32, 64, 128};
 
 inline Row load(const float* from) {
     Row row;
@@ -30,6 +32,20 @@ inline Row load(const float* from) {
 }
 
 inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
+
+// All bits of a vector's numbers.
+inline uint32_t bits_of(Mask mask) {
+    uint64_t parts[4];
+    std::memcpy(parts, &mask, sizeof(mask));
+    const uint64_t both = (parts[0] | parts[1]) | (parts[2] | parts[3]);
+    return static_cast<uint32_t>(both | both >> 32);
+}
+
+// Calls ``work`` with the place of each bit that is set, the lowest first.
+template <typename Work>
+inline void each_bit(uint32_t bits, Work work) {
+    for (; bits; bits &= bits - 1) work(__builtin_ctz(bits));
+}
 
 }  // namespace
 
@@ -64,10 +80,12 @@ struct Chunk {
     float half_a[CHUNK];          // of log2 alpha = base - half_a w^2
     float color[CHUNK][D ? D : 1];
     float r[CHUNK], a[CHUNK], d[CHUNK];
-    Row y[CHUNK], base[CHUNK], w[CHUNK], bound[CHUNK];  // by row of the tile: dv, base, w in its middle, largest log2 alpha
+    Row y[CHUNK], base[CHUNK], w[CHUNK];  // by row of the tile: dv, base, w in its middle
+    uint32_t reached[TILE], rows[CHUNK];  // bits of the Gaussians that reach each row, of the rows that each reaches
 
     void read(const Task& task, int64_t begin, int64_t end, float x, float y_centre) {
         size = static_cast<int>(end - begin);
+        Mask reaching = {};
         for (int k = 0; k < size; ++k) {
             const float* row = task.table + task.gaussians[begin + k] * (COLOR + D);
             const float half_d = 0.5f * row[4];
@@ -78,12 +96,13 @@ struct Chunk {
             base[k] = row[5] - half_d * (y[k] * y[k]);
             w[k] = s - row[2] * OFFSETS;
             const Row nearest = larger(magnitude(w[k]) - HALF, ZERO);
-            bound[k] = base[k] - half_a[k] * (nearest * nearest);
+            const Mask reaches = ~(base[k] - half_a[k] * (nearest * nearest) < task.log2_alpha_min - ROUNDING);
+            reaching |= reaches & static_cast<int32_t>(1u << k);
+            rows[k] = bits_of(reaches & BITS);
             for (int c = 0; c < D; ++c) color[k][c] = row[COLOR + c];
         }
+        std::memcpy(reached, &reaching, sizeof(reached));
     }
-
-    bool reaches(int k, int row, float log2_alpha_min) const { return !(bound[k][row] < log2_alpha_min - ROUNDING); }
 
     Row w_of(int k, int row) const { return OFFSETS + w[k][row]; }
 
@@ -127,16 +146,16 @@ void blend_tile(const Task& task, int64_t tile) {
             Row t = through[row], left = last[row], c[D];
             if (!(sum(t) > 0.0f)) continue;
             for (int i = 0; i < D; ++i) c[i] = color[row][i];
-            for (int k = 0; k < chunk.size; ++k) {
-                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+            each_bit(chunk.reached[row], [&](int k) {
                 const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
                 const Row after = t * (1.0f - alpha);
                 const Mask drawn = after > task.transmittance_min;
                 const Row weight = drawn ? alpha * t : ZERO;
-                t = drawn ? after : ZERO;
+                t = after;  // it falls: a pixel that is finished stays so
                 left = drawn ? after : left;
                 for (int i = 0; i < D; ++i) c[i] += weight * chunk.color[k][i];
-            }
+            });
+            t = t > task.transmittance_min ? t : ZERO;
             through[row] = t, last[row] = left;
             for (int i = 0; i < D; ++i) color[row][i] = c[i];
             unfinished |= sum(t) > 0.0f;
@@ -150,35 +169,36 @@ void blend_tile(const Task& task, int64_t tile) {
     }
 }
 
-// Writes the gradient sums of one Gaussian of a chunk on a tile, and adds its part to ``behind``.
+// Writes the gradient sums of one Gaussian of a chunk on a tile, and puts it before ``behind``: the colour behind, as a
+// product with the gradient of the image, and the gradient of the transmittance.
 template <int D, bool ABSOLUTE>
 void pass_back(const Task& task, const Chunk<D>& chunk, int k, const Row (&alphas)[TILE], const Row (&weights)[TILE],
                const Row (&pixels)[TILE][D], Row (&behind)[TILE], float* out) {
-    Row g_sum = ZERO, gw = ZERO, gww = ZERO, gv = ZERO, gvv = ZERO, gwv = ZERO, g_color[D] = {}, abs_x = ZERO, abs_y = ZERO;
-    for (int row = 0; row < TILE; ++row) {
-        if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+    constexpr int COLUMNS = MOMENTS + D + (ABSOLUTE ? 2 : 0);
+    Row w_sum = ZERO, ww = ZERO, v_sum = ZERO, vv = ZERO, wv = ZERO, one = ZERO, g_color[D] = {}, abs_x = ZERO, abs_y = ZERO;
+    each_bit(chunk.rows[k], [&](int row) {
         const Row alpha = alphas[row], weight = weights[row];
-        Row shade = pixels[row][0] * chunk.color[k][0];
-        for (int i = 1; i < D; ++i) shade += pixels[row][i] * chunk.color[k][i];
+        Row change = pixels[row][0] * chunk.color[k][0] - behind[row];
+        for (int i = 1; i < D; ++i) change += pixels[row][i] * chunk.color[k][i];
         for (int i = 0; i < D; ++i) g_color[i] += weight * pixels[row][i];
-        const Row term = weight * shade;
-        Row g = term - alpha / (1.0f - alpha) * behind[row];
-        g = alpha >= task.clamped_from ? ZERO : g;
-        behind[row] += term;
+        const Row g = alpha >= task.clamped_from ? ZERO : weight * change;
+        behind[row] += alpha * change;
         const Row w = chunk.w_of(k, row), g_w = g * w;
         const float v = chunk.y[k][row];
-        g_sum += g, gw += g_w, gww += g_w * w;
-        gv += g * v, gvv += g * (v * v), gwv += g_w * v;
+        one += g, w_sum += g_w, ww += g_w * w;
+        v_sum += g * v, vv += g * (v * v), wv += g_w * v;
         if (ABSOLUTE) {
             const Row along = w * chunk.a[k];
             abs_x += magnitude(g * along);
             abs_y += magnitude(g * (chunk.d[k] * v - chunk.r[k] * along));
         }
-    }
-    const Row moments[MOMENTS] = {gw, gww, gv, gvv, gwv, g_sum};
-    for (int i = 0; i < MOMENTS; ++i) out[i] = sum(moments[i]);
-    for (int i = 0; i < D; ++i) out[MOMENTS + i] = sum(g_color[i]);
-    if (ABSOLUTE) out[MOMENTS + D] = LN2 * sum(abs_x), out[MOMENTS + D + 1] = LN2 * sum(abs_y);
+    });
+    Row found[MOMENTS + D + 2] = {w_sum, ww, v_sum, vv, wv, one};
+    std::copy(g_color, g_color + D, found + MOMENTS);
+    found[MOMENTS + D] = LN2 * abs_x, found[MOMENTS + D + 1] = LN2 * abs_y;
+    constexpr int AT_ONCE = COLUMNS < LANES ? 0 : LANES;
+    if (AT_ONCE) store(out, sums(found));
+    for (int i = AT_ONCE; i < COLUMNS; ++i) out[i] = sum(found[i]);
 }
 
 template <int D, bool ABSOLUTE>
@@ -190,7 +210,7 @@ void differentiate_tile(const Task& task, int64_t tile) {
     Row pixels[TILE][D], behind[TILE], alphas[CHUNK][TILE], weights[CHUNK][TILE];
     for (int row = 0; row < TILE; ++row) {
         const int64_t at = tile * PIXELS + row * TILE;
-        behind[row] = load(task.grad_final + at) * load(task.final_ + at);
+        behind[row] = load(task.grad_final + at);
         for (int i = 0; i < D; ++i) pixels[row][i] = load(task.grad_image + (tile * D + i) * PIXELS + row * TILE);
     }
     Chunk<D> chunk;
@@ -199,15 +219,14 @@ void differentiate_tile(const Task& task, int64_t tile) {
         chunk.read(task, first, first + CHUNK < passed ? first + CHUNK : passed, place.x, place.y);
         for (int row = 0; row < TILE; ++row) {
             Row t = load(task.before + (task.chunks[tile] + which) * PIXELS + row * TILE);
-            for (int k = 0; k < chunk.size; ++k) {
-                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+            each_bit(chunk.reached[row], [&](int k) {
                 const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
                 const Row after = t * (1.0f - alpha);
                 const Mask drawn = after > task.transmittance_min;
                 alphas[k][row] = drawn ? alpha : ZERO;
                 weights[k][row] = drawn ? alpha * t : ZERO;
-                t = drawn ? after : ZERO;
-            }
+                t = after;
+            });
         }
         for (int k = chunk.size - 1; k >= 0; --k)
             pass_back<D, ABSOLUTE>(task, chunk, k, alphas[k], weights[k], pixels, behind, task.sums + (first + k) * COLUMNS);
@@ -227,14 +246,13 @@ void weigh_tile(const Task& task, int64_t tile) {
         for (int row = 0; row < TILE; ++row) {
             Row t = through[row];
             if (!(sum(t) > 0.0f)) continue;
-            for (int k = 0; k < chunk.size; ++k) {
-                if (!chunk.reaches(k, row, task.log2_alpha_min)) continue;
+            each_bit(chunk.reached[row], [&](int k) {
                 const Row alpha = chunk.alpha(k, row, chunk.w_of(k, row), task);
                 const Row after = t * (1.0f - alpha);
-                const Mask drawn = after > task.transmittance_min;
-                weights[k] += drawn ? alpha * t : ZERO;
-                t = drawn ? after : ZERO;
-            }
+                weights[k] += after > task.transmittance_min ? alpha * t : ZERO;
+                t = after;
+            });
+            t = t > task.transmittance_min ? t : ZERO;
             through[row] = t, left += t;
         }
         for (int k = 0; k < chunk.size; ++k) task.sums[at + k] = sum(weights[k]);
@@ -299,11 +317,15 @@ void pointsplat_weigh(const Task* task, int64_t* next) { each_tile(*task, next, 
 // For each of ``count`` Gaussians the sum of its pairs: rows ``pairs[starts[i]]`` to ``pairs[starts[i + 1] - 1]``.
 void pointsplat_gather(const float* sums, const int64_t* pairs, const int64_t* starts, const int64_t* order, int64_t count,
                        int64_t columns, float* out, int64_t* next) {
+    const int64_t last = starts[count] - 1;
     each_gaussian(next, count, [&](int64_t i) {
         float* to = out + order[i] * columns;
         for (int64_t c = 0; c < columns; ++c) to[c] = 0.0f;
-        for (int64_t j = starts[i]; j < starts[i + 1]; ++j)
+        for (int64_t j = starts[i]; j < starts[i + 1]; ++j) {
+            const float* ahead = sums + pairs[std::min(j + AHEAD, last)] * columns;
+            __builtin_prefetch(ahead), __builtin_prefetch(ahead + columns - 1);
             for (int64_t c = 0; c < columns; ++c) to[c] += sums[pairs[j] * columns + c];
+        }
     });
 }
 
