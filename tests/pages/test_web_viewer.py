@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import tracemalloc
 import urllib.error
 from pathlib import Path
 
@@ -126,6 +127,18 @@ def test_a_local_file_that_is_no_package_is_refused_and_nothing_is_unpacked(data
     with pytest.raises(ps.PointSplatError, match=f"a.tgz, which POINTSPLAT_WEB_VIEWER names: .*{words}") as raised:
         web_viewer(WebViewerPackage(largest=100_000))
     assert "\n" not in str(raised.value) and files_below(tmp_path) == [place]
+
+
+def test_a_small_file_that_unpacks_to_a_large_one_takes_no_memory(tmp_path, monkeypatch):
+    (tmp_path / "a.tgz").write_bytes(gzip.compress(bytes(64 << 20), 1))
+    monkeypatch.setenv("POINTSPLAT_WEB_VIEWER", str(tmp_path / "a.tgz"))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ps.PointSplatError, match="unpacks to more"):
+            web_viewer(WebViewerPackage(largest=1_000_000))
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20, "bytes; all of it has eight times as many"
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("kind", ["nothing", "an empty folder", "a pipe"])
