@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import quote
@@ -47,22 +46,16 @@ def is_stream_with_page(folder: Path) -> bool:
 
 
 def _route(file: Path) -> Route:
-    kind = _KINDS.get(file.suffix, "application/octet-stream")
-    headers = {"Content-Security-Policy": _POLICY} if file.suffix == ".html" else {}
+    """The route of a file, which is opened when it is asked for."""
+    text = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".txt": "text/plain"}
+    other = {".json": "application/json", ".webp": "image/webp"}
+    kind = other.get(file.suffix, "application/octet-stream")
+    if file.suffix in text:
+        kind = f"{text[file.suffix]}; charset=utf-8"
+    headers = {}
+    if file.suffix == ".html":  # nothing comes from elsewhere, whatever the page's address asks for
+        headers["Content-Security-Policy"] = (
+            "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+            "style-src 'self' 'unsafe-inline'; base-uri 'self'; form-action 'none'"
+        )
     return Route(lambda _: Answer(kind=kind, headers=headers, file=file))
-
-
-_KINDS: Mapping[str, str] = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".txt": "text/plain; charset=utf-8",
-    ".json": "application/json",
-    ".webp": "image/webp",
-}
-
-_POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
-    "style-src 'self' 'unsafe-inline'; base-uri 'self'; form-action 'none'"
-)
-"""Nothing comes from elsewhere, whatever the page's address asks for."""
