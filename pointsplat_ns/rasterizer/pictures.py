@@ -55,7 +55,8 @@ def _placed(
     channels, ranges, whole = (3 if colored else 0), -(-count // library.pointsplat_range()), _whole(camera[2])
     table, depths = torch.empty(count, 6 + channels), torch.empty(count, dtype=torch.float64)
     ids, boxes = torch.empty(count, dtype=torch.int32), torch.empty(count, 4, dtype=torch.int32)
-    counts, nearest = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.float64)
+    counts, heights = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.int64)
+    nearest = torch.empty(ranges, dtype=torch.float64)
     offsets = torch.zeros(whole.rows * whole.columns + 1, dtype=torch.int64)
     inputs = KernelInputs(table, channels, quality)
     task = KERNELS.structs["Placing"](
@@ -64,9 +65,12 @@ def _placed(
         degree=scene.sh_degree if colored else -1,
         rows=whole.rows, columns=whole.columns, log2_alpha_min=math.log2(quality.alpha_min), slack=SLACK,
         most_color=torch.finfo(torch.float32).max ** 0.8, table=table, ids=ids, depths=depths, boxes=boxes,
-        counts=counts, nearest=nearest, offsets=offsets,
+        counts=counts, heights=heights, nearest=nearest, offsets=offsets,
     )  # fmt: skip
     on_threads(count >= SEVERAL, library.pointsplat_place, task)
+    drawn = int(counts.sum())
+    order, strips = torch.empty(drawn, dtype=torch.int64), torch.empty(int(heights.sum()), 2, dtype=torch.int32)
+    task.fill(order=order, strips=strips)
     library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
@@ -74,9 +78,7 @@ def _placed(
         return None
     pairs = torch.empty(total, dtype=torch.int64)
     task.fill(offsets=offsets, pairs=pairs)
-    if total:
-        library.pointsplat_list(task, offsets[:-1].clone())
-        on_threads(total >= SEVERAL, library.pointsplat_sort, task)
+    library.pointsplat_list(task, drawn, offsets[:-1].clone())
     return inputs, pairs, offsets
 
 

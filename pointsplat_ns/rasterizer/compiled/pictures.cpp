@@ -12,6 +12,11 @@
 
 extern "C" {
 
+// The columns of tiles that an ellipse touches in one row of tiles; none if the last is before the first.
+struct Strip {
+    int32_t from, to;
+};
+
 struct Placing {
     Camera camera;
     Scene scene;
@@ -24,7 +29,10 @@ struct Placing {
     double* depths;    // [N] of these
     int32_t* boxes;    // [N, 4] first and last row of tiles, first and last column
     int64_t* counts;   // [ranges] how many are drawn
+    int64_t* heights;  // [ranges] sum of the rows of their boxes
     double* nearest;   // [ranges] least depth
+    int64_t* order;    // [M] places of the Gaussians that are drawn, front to back
+    Strip* strips;     // [rows of all boxes] in this order
     int64_t* offsets;  // [tiles + 1] where each tile's pairs start; before, in the next place, how many there are
     int64_t* pairs;    // [P] the Gaussians of each tile, front to back
 };
@@ -34,8 +42,8 @@ struct Placing {
 namespace {
 
 constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
-constexpr int GEOMETRY = 6, GRAB = 4;  // columns of the table before the colours; tiles that a thread takes at once
-constexpr int64_t FEW = 256;  // pairs that are sorted faster by comparing them
+constexpr int GEOMETRY = 6;    // columns of the table before the colours
+constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
 
 // Colours of up to eight Gaussians; NaN where a coefficient is not finite.
 template <int DEGREE>
@@ -99,62 +107,72 @@ void place_all(const Placing& task, int64_t* next) {
             to = place_lanes<DEGREE>(task, lanes, to);
         }
         task.counts[range] = to - first;
-        task.nearest[range] = std::numeric_limits<double>::infinity();
-        for (int64_t i = first; i < to; ++i) task.nearest[range] = std::min(task.nearest[range], task.depths[i]);
+        task.nearest[range] = std::numeric_limits<double>::infinity(), task.heights[range] = 0;
+        for (int64_t i = first; i < to; ++i) {
+            task.nearest[range] = std::min(task.nearest[range], task.depths[i]);
+            task.heights[range] += task.boxes[4 * i + 1] - task.boxes[4 * i] + 1;
+        }
     });
 }
 
-// Calls ``visit`` with each place of a drawn Gaussian and each tile that its ellipse touches.
-template <typename Visit>
-void each_pair(const Placing& task, Visit visit) {
-    const int64_t stride = GEOMETRY + (task.degree < 0 ? 0 : 3), ranges = (task.scene.count + RANGE - 1) / RANGE;
-    for (int64_t range = 0; range < ranges; ++range) {
-        for (int64_t i = range * RANGE; i < range * RANGE + task.counts[range]; ++i) {
-            const int32_t* box = task.boxes + 4 * i;
-            const int64_t across = box[3] - box[2] + 1;
-            if (across == 1 || box[0] == box[1]) {  // the ellipse touches all tiles of its box
-                for (int64_t row = box[0]; row <= box[1]; ++row)
-                    for (int64_t column = box[2]; column <= box[3]; ++column) visit(i, row * task.columns + column);
-                continue;
-            }
-            // In a row of tiles the ellipse a w^2 + d v^2 = 2 level reaches from r v - w to r v + w, at the v of the
-            // row that is nearest to where it is widest.
-            const float* s = task.table + stride * task.ids[i];
-            const float x = s[0], y = s[1], r = s[2], a = s[3], d = s[4];
-            const float level = 2.0f * std::max(s[5] - task.log2_alpha_min, 0.0f);
-            const float widest = r * std::sqrt(level / (d * (d / a + r * r)));
-            for (int64_t row = box[0]; row <= box[1]; ++row) {
-                const float top = row * TILE + (0.5f - task.slack) - y;
-                const float bottom = std::min(row * TILE + (TILE - 0.5f), task.camera.height - 0.5f) + task.slack - y;
-                const auto edge = [&](float v, float sign) {
-                    v = std::min(std::max(v, top), bottom);
-                    return x + r * v + sign * (std::sqrt(std::max(level - d * v * v, 0.0f) / a) + task.slack);
-                };
-                const int64_t from = tile_from(edge(-widest, -1.0f), task.columns);
-                const int64_t to = tile_to(edge(widest, 1.0f), task.columns);
-                for (int64_t column = from; column <= to; ++column) visit(i, row * task.columns + column);
-            }
-        }
+// Writes the strips of a Gaussian by its place: the columns in each row of tiles of its box.
+void write_strips(const Placing& task, int64_t i, Strip* strips) {
+    const int32_t* box = task.boxes + 4 * i;
+    if (box[2] == box[3] || box[0] == box[1]) {  // the ellipse touches all tiles of its box
+        std::fill(strips, strips + (box[1] - box[0] + 1), Strip{box[2], box[3]});
+        return;
+    }
+    // In a row of tiles the ellipse a w^2 + d v^2 = 2 level reaches from r v - w to r v + w, at the v of the row that is
+    // nearest to where it is widest.
+    const float* s = task.table + (GEOMETRY + (task.degree < 0 ? 0 : 3)) * static_cast<int64_t>(task.ids[i]);
+    const float x = s[0], y = s[1], r = s[2], a = s[3], d = s[4];
+    const float level = 2.0f * std::max(s[5] - task.log2_alpha_min, 0.0f);
+    const float widest = r * std::sqrt(level / (d * (d / a + r * r)));
+    for (int32_t row = box[0]; row <= box[1]; ++row) {
+        const float top = row * TILE + (0.5f - task.slack) - y;
+        const float bottom = std::min(row * TILE + (TILE - 0.5f), task.camera.height - 0.5f) + task.slack - y;
+        const auto edge = [&](float v, float sign) {
+            v = std::min(std::max(v, top), bottom);
+            return x + r * v + sign * (std::sqrt(std::max(level - d * v * v, 0.0f) / a) + task.slack);
+        };
+        *strips++ = {static_cast<int32_t>(tile_from(edge(-widest, -1.0f), task.columns)),
+                     static_cast<int32_t>(tile_to(edge(widest, 1.0f), task.columns))};
     }
 }
 
-// Sorts pairs by depth, equal ones as they stand, by three digits of 11 bits, and leaves the Gaussians. ``other`` has room
-// for as many.
-void sort_by_depth(int64_t* pairs, int64_t count, int64_t* other) {
+// Calls ``visit`` with each Gaussian and each tile that its strips touch, front to back; ``before`` first, with its place
+// and its strips.
+template <typename Before, typename Visit>
+void each_pair(const Placing& task, int64_t drawn, Before before, Visit visit) {
+    Strip* strips = task.strips;
+    for (int64_t at = 0; at < drawn; ++at) {
+        const int64_t i = task.order[at], ahead = task.order[std::min(at + AHEAD, drawn - 1)];
+        __builtin_prefetch(task.boxes + 4 * ahead), __builtin_prefetch(task.ids + ahead);
+        before(at, i, strips);
+        for (int64_t row = task.boxes[4 * i]; row <= task.boxes[4 * i + 1]; ++row, ++strips)
+            for (int64_t column = strips->from; column <= strips->to; ++column)
+                visit(task.ids[i], row * task.columns + column);
+    }
+}
+
+// Sorts places by the depth in their upper half, equal ones as they stand, by three digits of 11 bits, and leaves the
+// places.
+void sort_by_depth(int64_t* values, int64_t count) {
     constexpr int DIGITS = 3, BITS = 11, VALUES = 1 << BITS;
+    std::vector<int64_t> other(count);
     int32_t places[DIGITS][VALUES] = {};
-    const auto digit = [](int64_t pair, int which) { return pair >> (32 + BITS * which) & (VALUES - 1); };
+    const auto digit = [](int64_t value, int which) { return value >> (32 + BITS * which) & (VALUES - 1); };
     for (int64_t i = 0; i < count; ++i)
-        for (int which = 0; which < DIGITS; ++which) ++places[which][digit(pairs[i], which)];
-    int64_t *from = pairs, *to = other;
+        for (int which = 0; which < DIGITS; ++which) ++places[which][digit(values[i], which)];
+    int64_t *from = values, *to = other.data();
     for (int which = 0; which < DIGITS; ++which) {
-        if (places[which][digit(pairs[0], which)] == count) continue;  // all the same
+        if (places[which][digit(values[0], which)] == count) continue;  // all the same
         int32_t sum = 0;
         for (int32_t& place : places[which]) sum += std::exchange(place, sum);
         for (int64_t i = 0; i < count; ++i) to[places[which][digit(from[i], which)]++] = from[i];
         std::swap(from, to);
     }
-    for (int64_t i = 0; i < count; ++i) pairs[i] = from[i] & 0xffffffff;
+    for (int64_t i = 0; i < count; ++i) values[i] = from[i] & 0xffffffff;
 }
 
 }  // namespace
@@ -174,41 +192,37 @@ void pointsplat_place(const Placing* task, int64_t* next) {
     }
 }
 
-// Counts the pairs of each tile into ``offsets``, from its second place on.
+// Orders the Gaussians by depth, equal ones by row, writes their strips, and counts the pairs of each tile into ``offsets``,
+// from its second place on.
 void pointsplat_count(const Placing* task) {
-    each_pair(*task, [&](int64_t, int64_t tile) { ++task->offsets[tile + 1]; });
-}
-
-// Writes the pairs of each tile from ``free``, [tiles], on: depth in the upper half, which orders them, then the Gaussian.
-void pointsplat_list(const Placing* task, int64_t* free) {
-    double* end = task->nearest + (task->scene.count + RANGE - 1) / RANGE;
-    const double nearest = *std::min_element(task->nearest, end);
-    each_pair(*task, [&](int64_t i, int64_t tile) {
-        const float beyond = static_cast<float>(task->depths[i] - nearest);  // not negative: ordered as its bits
-        int32_t bits;
-        std::memcpy(&bits, &beyond, sizeof(bits));
-        task->pairs[free[tile]++] = static_cast<int64_t>(bits) << 32 | task->ids[i];
-    });
-}
-
-// Sorts the pairs of each tile by depth, equal ones by Gaussian, and leaves the Gaussians.
-void pointsplat_sort(const Placing* task, int64_t* next) {
-    const int64_t tiles = task->rows * task->columns;
-    std::vector<int64_t> other;
-    for (;;) {
-        const int64_t first = __atomic_fetch_add(next, GRAB, __ATOMIC_RELAXED);
-        if (first >= tiles) return;
-        for (int64_t tile = first; tile < std::min(first + GRAB, tiles); ++tile) {
-            int64_t *begin = task->pairs + task->offsets[tile], *end = task->pairs + task->offsets[tile + 1];
-            if (end - begin < FEW) {
-                std::sort(begin, end);
-                for (int64_t* pair = begin; pair < end; ++pair) *pair &= 0xffffffff;
-            } else {
-                other.resize(std::max<size_t>(other.size(), end - begin));
-                sort_by_depth(begin, end - begin, other.data());
-            }
+    const int64_t ranges = (task->scene.count + RANGE - 1) / RANGE;
+    const double nearest = *std::min_element(task->nearest, task->nearest + ranges);
+    int64_t drawn = 0;
+    for (int64_t range = 0; range < ranges; ++range) {
+        for (int64_t i = range * RANGE; i < range * RANGE + task->counts[range]; ++i) {
+            const float beyond = static_cast<float>(task->depths[i] - nearest);  // not negative: ordered as its bits
+            int32_t bits;
+            std::memcpy(&bits, &beyond, sizeof(bits));
+            task->order[drawn++] = static_cast<int64_t>(bits) << 32 | i;
         }
     }
+    if (drawn == 0) return;
+    sort_by_depth(task->order, drawn);
+    const int64_t stride = GEOMETRY + (task->degree < 0 ? 0 : 3);
+    each_pair(
+        *task, drawn,
+        [&](int64_t at, int64_t i, Strip* strips) {
+            const int64_t ahead = task->order[std::min(at + AHEAD / 2, drawn - 1)];
+            __builtin_prefetch(task->table + stride * task->ids[ahead]);
+            write_strips(*task, i, strips);
+        },
+        [&](int64_t, int64_t tile) { ++task->offsets[tile + 1]; });
+}
+
+// Writes the Gaussians of each tile, front to back, from ``free``, [tiles], on.
+void pointsplat_list(const Placing* task, int64_t drawn, int64_t* free) {
+    each_pair(
+        *task, drawn, [](int64_t, int64_t, Strip*) {}, [&](int64_t row, int64_t tile) { task->pairs[free[tile]++] = row; });
 }
 
 }  // extern "C"
