@@ -128,7 +128,8 @@ def _across(axes: Tensor) -> Tensor:
 def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
     """The axis (3,) along which a scene stands, float64, of length 1 and of either sign.
 
-    It is the y axis or the z axis of the world if one of them fits about as well as the best direction.
+    It is an axis of the world if that fits about as well as the best direction, and y if that fits about as well as the
+    best of the three.
 
     Args:
         surface: points of the scene, and the settings.
@@ -151,10 +152,10 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
         found = torch.cat([found, _nearby(found, math.radians(degrees))])
         scores = scores_of(found)
         found = found[scores.topk(settings.refined_directions).indices]
-    usual = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    factors = settings.usual_axis_factors if photos is None else (1.05, 1.05)
-    usual_scores = usual.new_tensor(factors) * scores_of(usual)
-    return usual[usual_scores.argmax()] if bool(usual_scores.max() >= scores.max()) else found[0]
+    of_world, of_y = settings.usual_axis_factors if photos is None else (1.05, 1.0)
+    world = torch.eye(3, dtype=torch.float64)
+    world_scores = world.new_tensor([of_world, of_world * of_y, of_world]) * scores_of(world)
+    return world[world_scores.argmax()] if bool(world_scores.max() >= scores.max()) else found[0]
 
 
 def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:

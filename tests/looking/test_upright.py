@@ -10,7 +10,9 @@ from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.api import example_room
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io import turning
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
@@ -26,12 +28,14 @@ PLACES = torch.linspace(0, 2 * math.pi, 61)[:60]
 
 EDGES = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
 
+SIX = [(sign * x, sign * y, sign * z) for x, y, z in EDGES for sign in (1, -1)]
+
 
 def degrees_between(a: torch.Tensor, b: torch.Tensor) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, float(a @ b)))))
 
 
-@pytest.mark.parametrize("turn", TURNS[1:])  # along world axes, walls of a room may be preferred to its floor
+@pytest.mark.parametrize("turn", TURNS[1:])  # along world axes, y is preferred to the floor of a room
 @pytest.mark.parametrize("make", [room, tower])
 def test_the_upright_axis_is_found_however_the_scene_is_turned(make, turn):
     scene = turned(make(), turn)
@@ -39,6 +43,20 @@ def test_the_upright_axis_is_found_however_the_scene_is_turned(make, turn):
     # 3 degrees: directions are refined in steps of half a degree, from points of which some lie across
     angle = degrees_between(axis, torch.from_numpy(turn.apply(UP.numpy())))
     assert min(angle, 180 - angle) < 3
+
+
+@pytest.fixture(scope="module")
+def part_of_the_example_room() -> Gaussians:
+    return example_room()[::8]
+
+
+@pytest.mark.parametrize("axis", SIX)
+def test_what_stands_along_an_axis_of_the_world_is_found_there_whichever_it_is(axis, part_of_the_example_room):
+    turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
+    matrix = torch.from_numpy(turn.as_matrix()).round()
+    for scene in (turned(tower(), turn), turning.turned(part_of_the_example_room, matrix)):
+        found = upright_axis(Surface.of(scene, *content_size(scene)))
+        assert found.abs().tolist() == [abs(value) for value in axis]
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
@@ -129,7 +147,7 @@ def test_an_object_is_whole_and_upright_from_every_side(turn, width, height):
     assert float(torch.cdist(eyes, eyes).fill_diagonal_(9.0).min()) > 1.0, "the views are from different sides"
 
 
-@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0), (0, 1, 0)])
+@pytest.mark.parametrize("axis", SIX)
 def test_up_is_the_side_from_which_more_is_seen(axis):
     """Also where -y is usual."""
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
