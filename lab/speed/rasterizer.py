@@ -29,8 +29,10 @@ from pointsplat_ns.metrics import psnr
 from pointsplat_ns.rasterizer import binning, rasterization
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.colors import sh_to_color
+from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, project
 from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.system.threads import one_thread
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "eager": {"compiled": False},
@@ -86,6 +88,8 @@ class Result:
     height: int
     gaussians: int
     visible: int
+    pairs: int
+    """Pairs of a Gaussian and a pixel on which it is drawn."""
     seconds: dict[str, float]
     memory: dict[str, int | None]
     errors: dict[str, float] = field(default_factory=dict)
@@ -161,11 +165,23 @@ class Case:
         spans["blending"] = max(0.0, spans["blending"] - lists)
         return {f"stage {name}": span for name, span in spans.items()}
 
-    def visible(self) -> int:
-        with torch.no_grad():
-            seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
-        footprints = self.footprints_of(seen)
-        return int(torch.unique(footprints.tiles(footprints.whole).gaussians).numel())
+    def time_exponential(self) -> dict[str, float]:
+        """One exponential, in numbers that stay in the cache, on one thread."""
+        numbers, calls = torch.full((2**12,), -1.0, device=self.device), 200
+        with one_thread():
+            start = now()
+            for _ in range(calls):
+                torch.exp2(numbers)
+            return {"exponential": (now() - start) / (calls * len(numbers))}
+
+    @torch.no_grad()
+    def drawn(self) -> tuple[int, int]:
+        """Gaussians that are drawn, and pairs of them and a pixel."""
+        seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
+        counts = sum_over_pixels(
+            seen, self.width, self.height, 1, lambda block: (block.alpha > 0).sum(-1, keepdim=True).to(block.alpha)
+        )
+        return int((counts > 0).sum()), int(counts.double().sum())
 
 
 def run_case(case: Case, args: Args) -> Result:
@@ -180,6 +196,7 @@ def run_case(case: Case, args: Args) -> Result:
         name: partial(case.time_variant, name) for name in args.variants
     }
     functions["stages"] = case.time_stages
+    functions["exponential"] = case.time_exponential
     seconds = timed(functions, args.repeats, args.budget, args.fastest)
 
     def forward() -> None:
@@ -191,7 +208,7 @@ def run_case(case: Case, args: Args) -> Result:
         "training": peak_extra_bytes(lambda: case.gradients(*case.draw(base)), case.device),
     }
     scene, size = case.scene, (case.width, case.height)
-    return Result(scene.name, scene.family, *size, len(scene), case.visible(), seconds, memory, errors)
+    return Result(scene.name, scene.family, *size, len(scene), *case.drawn(), seconds, memory, errors)
 
 
 def plan(args: Args) -> list[tuple[Scene, tuple[int, int]]]:
@@ -228,8 +245,26 @@ def print_tables(results: list[Result], variants: tuple[str, ...]) -> None:
     def error(name: str, value: float | None) -> str:
         return "-" if value is None else f"{value:{'.1f' if name.endswith('PSNR') else '.1e'}}"
 
-    times = {name.removeprefix("stage "): lambda r, n=name: ms(r.seconds.get(n)) for name in timed_names}
+    times = {
+        name.removeprefix("stage "): lambda r, n=name: ms(r.seconds.get(n))
+        for name in timed_names
+        if name != "exponential"
+    }
+
+    def exponentials(result: Result, *stages: str) -> str:
+        """Time of stages over that of one exponential for each pair."""
+        taken = sum(result.seconds[f"stage {stage}"] for stage in stages)
+        return over(taken, result.pairs * result.seconds["exponential"])
+
     show("Milliseconds", {"visible": lambda r: f"{r.visible:,}", **times})
+    show(
+        "Time of blending over that of one exponential for each pair of a Gaussian and a pixel on which it is drawn",
+        {
+            "pairs, millions": lambda r: f"{r.pairs / 1e6:.1f}",
+            "blending": lambda r: exponentials(r, "blending"),
+            "and backward": lambda r: exponentials(r, "blending", "blending backward"),
+        },
+    )
     show(
         f"Seconds of forward and backward in those of {base} (above 1: slower); {base}'s peak memory, MB",
         {

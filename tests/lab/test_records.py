@@ -97,6 +97,7 @@ def test_variants_are_timed_stage_by_stage_with_their_errors(tmp_path, capsys):
     assert {f"stage {name}" for name in rasterizer.STAGES} <= set(case["seconds"])
     assert all(case["seconds"][f"fast {name}"] > 0 for name in ("inference", "forward", "backward"))
     assert case["errors"]["eager max"] == 0 < case["errors"]["fast max"] and 20 < case["errors"]["fast PSNR"] < 80
+    assert 32 * 24 * 300 > case["pairs"] > case["visible"] > 0 and 300 >= case["visible"]
     assert "in those of eager" in capsys.readouterr().out
 
 
