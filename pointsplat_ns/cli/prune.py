@@ -89,7 +89,8 @@ def prune(
         jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
         shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
-            parts, with files beside the output; a command that was killed goes on.
+            parts, with files beside the output; a command that was killed goes on. Under torchrun, processes share
+            the parts; each may take so much.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
@@ -99,9 +100,10 @@ def prune(
     from pointsplat_ns.compacting import prune_source
     from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
-    from pointsplat_ns.errors import SceneError
+    from pointsplat_ns.errors import PointSplatError, SceneError
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.system.processes import connect_torchrun, together, torchrun_rank
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
@@ -118,9 +120,16 @@ def prune(
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
-    claim_outputs(written, force, plot)
+    connect_torchrun()
+    rank, processes = torchrun_rank()
+    together(lambda: claim_outputs(written, force, plot) if rank == 0 else None)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune).in_format(format_to_write(output))
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
+    if processes > 1 and (rows is None or memory is None):
+        raise PointSplatError(
+            f"{scene}: {processes} processes share the parts of a scene larger than --memory; expected one process, or "
+            "a --memory that the scene does not fit into"
+        )
     if rows is not None:
         if dry_run or plot is not None:
             raise SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
@@ -162,11 +171,14 @@ def _prune_in_parts(
     from pointsplat_ns.io.ply import PlyRows
     from pointsplat_ns.looking.sizes import parse_resolution
     from pointsplat_ns.looking.upright import up_named
+    from pointsplat_ns.system.processes import rank
     from pointsplat_ns.system.progress import progress_bar
 
     size, limit = parse_resolution(resolution), None if memory is None else 1e6 * memory
-    with progress_bar() as report:
+    with progress_bar(rank() == 0) as report:
         before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report)
+    if rank() > 0:
+        return  # the first process speaks for all
     small = PlyRows.open(output)
     assert small is not None
     if json_output:

@@ -24,6 +24,7 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.system.processes import first_alone, rank
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -104,6 +105,7 @@ def prune_file(
     progress: Progress = silent,
 ) -> tuple[int, float]:
     """Merge a PLY cell by cell. A call that was killed goes on where it was, from a hidden folder beside the output.
+    Processes that ``torchrun`` connected share the cells, each within ``memory``.
 
     Args:
         rows: the scene, as of :func:`rows_to_prune`.
@@ -155,10 +157,12 @@ def prune_file(
         return count
 
     count_of(rows.count)  # errors before the work
-    scratch = Scratch(output.with_name(f".{output.name}.cells"), work, rows.count * (_row_bytes(rows) + 350))
+    size = rows.count * (_row_bytes(rows) + 350)
+    scratch = first_alone(lambda: Scratch(output.with_name(f".{output.name}.cells"), work, size))
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
     before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress)
-    scratch.remove()
+    if rank() == 0:
+        scratch.remove()
     return before, time.perf_counter() - start
 
 

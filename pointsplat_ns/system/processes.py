@@ -9,12 +9,16 @@ from __future__ import annotations
 import atexit
 import datetime
 import os
-from collections.abc import Iterable
-from typing import Any, Literal
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import nn
+
+from pointsplat_ns.errors import PointSplatError
+
+Result = TypeVar("Result")
 
 
 def torchrun_rank() -> tuple[int, int]:
@@ -48,7 +52,7 @@ def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
 
 
 def world_size() -> int:
-    """Number of processes that train together."""
+    """Number of processes that work together."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
@@ -73,6 +77,35 @@ def gathered(items: list[Any]) -> list[Any]:
     parts: list[Any] = [None] * world_size()
     dist.all_gather_object(parts, items)
     return [item for part in parts for item in part]
+
+
+def together(work: Callable[[], object]) -> None:
+    """Do this process's part of a work, and wait until all processes have done theirs.
+
+    Raises:
+        PointSplatError: if another process failed or ended; the own error if it is this one.
+    """
+    failure: Exception | None = None
+    try:
+        work()
+    except Exception as error:
+        failure = error
+    try:
+        texts = gathered([failure and (str(failure) or type(failure).__name__)])
+    except RuntimeError as error:  # of the connection
+        raise failure or PointSplatError("another process ended; the same command goes on") from error
+    if failure is not None:
+        raise failure
+    for number, text in enumerate(texts):
+        if text:
+            raise PointSplatError(f"process {number} of {len(texts)} failed: {text}")
+
+
+def first_alone(make: Callable[[], Result]) -> Result:
+    """What ``make`` gives in each process; the first one calls it before the others, which find what it left."""
+    made: list[Result] = []
+    together(lambda: made.append(make()) if rank() == 0 else None)
+    return made[0] if made else make()
 
 
 @torch.no_grad()

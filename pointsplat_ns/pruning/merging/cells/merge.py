@@ -1,4 +1,7 @@
-"""The steps that merge a scene cell by cell."""
+"""The steps that merge a scene cell by cell.
+
+Under ``torchrun`` a cell is merged by the process whose turn it is. Files hold all that passes between processes.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,7 @@ from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.rounds import merge
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
+from pointsplat_ns.system.processes import first_alone, rank, together, world_size
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
@@ -51,7 +55,8 @@ def merge_file(
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
 ) -> tuple[int, int]:
-    """Merge the Gaussians of a file, and write those that remain, cell by cell.
+    """Merge the Gaussians of a file, and write those that remain, cell by cell. Connected processes share the cells:
+    each calls this with a scratch of the same folder, and the first one writes the output.
 
     Args:
         rows: the Gaussians. Those that cannot be drawn are dropped.
@@ -70,8 +75,9 @@ def merge_file(
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
         BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that remain.
+        PointSplatError: if another process fails.
     """
-    cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
+    cells = first_alone(lambda: divided(rows, most, scratch, functools.partial(progress, "dividing into cells")))
     k = count_of(cells.count)
     if k < len(cells):
         raise BudgetError(
@@ -83,14 +89,19 @@ def merge_file(
         with one_thread_each():
             return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
 
-    work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
-    rounds = work.merged(progress)
-    with replacing(output, ply_bytes(k, rows.sh_degree, rows.antialiased)) as part, part.open("wb") as stream:
-        stream.write(header_bytes(k, rows.sh_degree, rows.antialiased))
-        for done, path in enumerate(work.finished(rounds)):
-            progress("finishing", done / len(cells))
-            with path.open("rb") as finished:
-                shutil.copyfileobj(finished, stream, 1 << 20)
+    overview = Overview(**first_alone(lambda: scratch.tensors("overview", look)))
+    work = _Work(cells, overview, k, sampler, settings, progress)
+    rounds = work.merged()
+    together(lambda: work.finish(rounds))
+
+    def join() -> None:
+        with replacing(output, ply_bytes(k, rows.sh_degree, rows.antialiased)) as part, part.open("wb") as stream:
+            stream.write(header_bytes(k, rows.sh_degree, rows.antialiased))
+            for cell in range(len(cells)):
+                with work.finished(cell).open("rb") as finished:
+                    shutil.copyfileobj(finished, stream, 1 << 20)
+
+    together(lambda: join() if rank() == 0 else None)
     return cells.count, k
 
 
@@ -103,31 +114,50 @@ class _Work:
     k: int
     sampler: Callable[[Gaussians], Sampler]
     settings: MergeSettings
+    progress: Progress
 
-    def merged(self, progress: Progress) -> int:
+    def merged(self) -> int:
         """Choose pairs until ``k`` Gaussians remain, and return the number of rounds."""
         number, left = 0, -1
         while left != self.k:
-            chosen = self.cells.scratch.tensors(_chosen(number), functools.partial(self._choose, number, progress))
+            together(functools.partial(self._find, number))
+            choose = functools.partial(self._choose, number)
+            chosen = first_alone(functools.partial(self.cells.scratch.tensors, _chosen(number), choose))
             number, left = number + 1, int(chosen["left"])
         return number
 
-    def finished(self, rounds: int) -> Iterator[Path]:
-        """Files of the rows of each cell, after so many rounds."""
-        scratch, numbers = self.cells.scratch, range(len(self.cells))
-        changes = [scratch.known(_sizes(cell))["changes"] for cell in numbers]
+    def finish(self, rounds: int) -> None:
+        """Write the rows of the own cells after so many rounds."""
+        scratch = self.cells.scratch
+        changes = [scratch.known(_sizes(cell))["changes"] for cell in range(len(self.cells))]
         change = float(torch.cat(changes).mean())
-        for cell in numbers:
-            yield scratch.file(f"finished_{cell:04d}.rows", functools.partial(self._write, rounds, cell, change))
+        for cell in self._own("finishing"):
+            scratch.file(_finished(cell), functools.partial(self._write, rounds, cell, change))
 
-    def _choose(self, number: int, progress: Progress) -> dict[str, Tensor]:
+    def finished(self, cell: int) -> Path:
+        """The file of the rows of a cell."""
+        return self.cells.scratch.folder / _finished(cell)
+
+    def _own(self, what: str) -> Iterator[int]:
+        """The cells of this process; tells how far it is with ``what``."""
+        own = range(rank(), len(self.cells), world_size())
+        for done, cell in enumerate(own):
+            self.progress(what, done / len(own))
+            yield cell
+
+    def _find(self, number: int) -> None:
+        """Find the pairs of the own cells that may be merged in a round, unless it has been chosen of them."""
+        scratch = self.cells.scratch
+        for cell in () if scratch.has(_chosen(number)) else self._own(f"merging, round {number + 1}"):
+            scratch.make(_round(number, cell), functools.partial(self._round, number, cell))
+            scratch.drop(_round(number - 2, cell))
+
+    def _choose(self, number: int) -> dict[str, Tensor]:
         """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
         ``left`` then."""
-        scratch, left, prices = self.cells.scratch, 0, []
+        left, prices = 0, []
         for cell in range(len(self.cells)):
-            progress(f"merging, round {number + 1}", cell / len(self.cells))
-            found = scratch.tensors(_round(number, cell), functools.partial(self._round, number, cell))
-            scratch.drop(_round(number - 2, cell))
+            found = self.cells.scratch.known(_round(number, cell))
             left += len(found["means"])
             prices.append(found["prices"])
         most = min(left - self.k, max(1, int(left * self.settings.round_share)))
@@ -211,6 +241,10 @@ def _round(number: int, cell: int) -> str:
 
 def _chosen(number: int) -> str:
     return f"chosen_{number}"
+
+
+def _finished(cell: int) -> str:
+    return f"finished_{cell:04d}.rows"
 
 
 def _sizes(cell: int) -> str:

@@ -43,10 +43,18 @@ class Scratch:
             write_json(work, known)
 
     def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
-        """The tensors of a step, which is taken if it was not before. They are mapped from its file."""
-        if not self._path(name).is_file():
-            write_tensors(self._path(name), make(), {})
+        """The tensors of a step, which is taken if it was not before."""
+        self.make(name, make)
         return self.known(name)
+
+    def make(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> None:
+        """Take a step, unless it was taken before."""
+        if not self.has(name):
+            write_tensors(self._path(name), make(), {})
+
+    def has(self, name: str) -> bool:
+        """Whether a step was taken that gave tensors."""
+        return self._path(name).is_file()
 
     def known(self, name: str) -> dict[str, Tensor]:
         """The tensors of a step that was taken. Raises SceneError if its file is gone or damaged."""
