@@ -213,7 +213,7 @@ def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
 
 def _pairs(near: Tensor, costs: Tensor, most: int) -> set[tuple[int, int]]:
     """What one round would merge."""
-    first, second = cheapest_pairs(near, costs.float(), most)
+    first, second = cheapest_pairs(near, costs.float().clone(), most)
     return set(zip(first.tolist(), second.tolist(), strict=True))
 
 

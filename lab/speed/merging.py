@@ -46,14 +46,14 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     state = initial_state(participants, torch.ones(len(participants)), MERGING)
     near = other_neighbours(state.means, MERGING.neighbours)
     costs = pair_costs(state, near)
-    first, second = cheapest_pairs(near, costs, int(MERGING.round_share * len(state)))
+    first, second = cheapest_pairs(near, costs.clone(), int(MERGING.round_share * len(state)))
     members, count = Members(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = group_moments(members, group, count)
     parts: dict[str, Part] = {
         "neighbours": partial(other_neighbours, state.means, MERGING.neighbours),
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
-        "matching": lambda compiled: cheapest_pairs(near, costs, len(first), compiled=compiled),
+        "matching": lambda compiled: cheapest_pairs(near, costs.clone(), len(first), compiled=compiled),
         "replacement": lambda compiled: replace_pairs(state, first, second, MERGING, compiled),
         "choice of groups": lambda compiled: best_groups(members, group, groups, compiled=compiled),
     }

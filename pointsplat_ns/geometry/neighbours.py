@@ -91,7 +91,9 @@ def other_neighbours(points: Tensor, k: int, compiled: bool | None = None) -> Te
         before, after = torch.empty_like(walk), torch.empty_like(walk)
         before[walk], after[walk] = walk.roll(1), walk.roll(-1)
         near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
-    return near.where(near >= 0, torch.arange(len(points), dtype=torch.int32)[:, None])
+    none = (near < 0).nonzero(as_tuple=True)
+    near[none] = none[0].to(torch.int32)
+    return near
 
 
 def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:

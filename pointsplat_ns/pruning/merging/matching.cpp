@@ -9,8 +9,7 @@ extern "C" {
 
 struct Matching {
     const int32_t* near;  // [n, k]
-    const float* given;   // [n, k] costs
-    float* costs;         // [n, k] costs with each pair once; infinite for pairs that cannot be
+    float* costs;         // [n, k]; then with each pair once, and infinite for pairs that cannot be
     int64_t count, neighbours, passes;
     int64_t* best;               // [n]
     int64_t* rows;               // [n] 0 to n - 1
@@ -36,16 +35,19 @@ inline int64_t key_of(const Matching& m, int64_t slot) {
 
 extern "C" {
 
-void pointsplat_symmetric(const Matching* task, int64_t* next) {
+// Gives pairs whose second member has the larger index, or the smaller one, their one cost. The larger come first, as
+// they read the costs of the smaller.
+void pointsplat_symmetric(const Matching* task, int64_t larger, int64_t* next) {
     const Matching& m = *task;
     const int64_t k = m.neighbours;
     each_range(next, m.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i)
             for (int64_t slot = k * i; slot < k * (i + 1); ++slot) {
                 const int64_t j = m.near[slot];
+                if ((j > i) != (larger != 0)) continue;
                 const int32_t* back = std::find(m.near + k * j, m.near + k * (j + 1), static_cast<int32_t>(i));
-                float cost = m.given[slot];
-                if (back != m.near + k * (j + 1)) cost = j > i ? (cost + m.given[back - m.near]) / 2 : NEVER;
+                float cost = m.costs[slot];
+                if (back != m.near + k * (j + 1)) cost = j > i ? (cost + m.costs[back - m.near]) / 2 : NEVER;
                 m.costs[slot] = j != i && cost == cost ? cost : NEVER;
             }
     });

@@ -26,7 +26,7 @@ def cheapest_pairs(
     Args:
         near: (n, k) int32, indices of the neighbours of each Gaussian; its own index means none.
         costs: (n, k) float32, at least 0, of merging each with each neighbour. Where two are neighbours of each other,
-            the mean of their two costs counts.
+            the mean of their two costs counts. They are overwritten.
         most: largest number of pairs.
         passes: number of passes.
         compiled: False leaves it to torch; True warns if the kernels could not be compiled.
@@ -113,16 +113,17 @@ def _keys(rows: Tensor, costs: Tensor) -> Tensor:
 
 
 def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`_candidates`, to the bit."""
+    """As :func:`_candidates`, to the bit; overwrites the costs."""
     n, k = near.shape
     pairs = [torch.empty(n // 2, dtype=dtype) for dtype in (torch.int64, torch.int64, torch.float32)]
     found = torch.zeros(1, dtype=torch.int64)
     task = KERNELS.structs["Matching"](
-        near=near.contiguous(), given=costs.contiguous(), costs=torch.empty_like(costs), count=n, neighbours=k,
+        near=near.contiguous(), costs=costs.contiguous(), count=n, neighbours=k,
         passes=passes, best=torch.empty(n, dtype=torch.int64), rows=torch.arange(n), found=found,
         **dict(zip(("firsts", "seconds", "prices"), pairs, strict=True)),
     )  # fmt: skip
-    on_threads(n >= SEVERAL, KERNELS.library.pointsplat_symmetric, task, threads=most_threads())
+    for larger in (1, 0):
+        on_threads(n >= SEVERAL, KERNELS.library.pointsplat_symmetric, task, larger, threads=most_threads())
     KERNELS.library.pointsplat_match(task)
     first, second, price = (values[: int(found)] for values in pairs)
     return first, second, price
@@ -133,7 +134,7 @@ def _as_torch() -> bool:
     generator = torch.Generator().manual_seed(0)
     near = ((torch.arange(200)[:, None] + torch.tensor([-9, -2, -1, 1, 2, 5])) % 200).to(torch.int32)
     costs = torch.randint(9, (200, 6), generator=generator).float()  # many of them equal
-    found = [function(near, costs, 4) for function in (_by_kernels, _candidates)]
+    found = [function(near, costs.clone(), 4) for function in (_by_kernels, _candidates)]
     return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 

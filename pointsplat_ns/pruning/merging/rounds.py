@@ -184,6 +184,8 @@ def _levels(
         if step is None or left < len(step.participants):
             with one_thread_each():
                 step = first_step(copies.reduced(left), views, settings)
+        if k == last:
+            del copies
         while len(step.state) > k:
             with one_thread_each():
                 step = one_round(step, k, settings)
