@@ -196,7 +196,10 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
 def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
     centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
     everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
-    states = [initial_state(Participants(part, everyone, centre, size), equal, MERGING) for part in (scene, truth)]
+    states = [
+        initial_state(Participants(part, everyone, centre, size), equal, MERGING, dtype=dtype)
+        for part, dtype in ((scene, torch.float32), (truth, torch.float64))
+    ]
     near = other_neighbours(states[1].means, MERGING.neighbours)
     costs, wanted = pair_costs(states[0], near), pair_costs(states[1], near, dtype=torch.float64)
     there = near != torch.arange(len(near))[:, None]

@@ -44,14 +44,14 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     """The parts of merging, by name, as functions of whether they use compiled kernels."""
     participants = Participants.of(scene, scene.usable().nonzero()[:, 0])
     state = initial_state(participants, torch.ones(len(participants)), MERGING)
-    near = other_neighbours(state.means, MERGING.neighbours)
+    near = other_neighbours(state.means.double(), MERGING.neighbours)
     costs = pair_costs(state, near)
     first, second = cheapest_pairs(near, costs.clone(), int(MERGING.round_share * len(state)))
     members, count = Members(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = group_moments(members, group, count)
     parts: dict[str, Part] = {
-        "neighbours": partial(other_neighbours, state.means, MERGING.neighbours),
+        "neighbours": partial(other_neighbours, state.means.double(), MERGING.neighbours),
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
         "matching": lambda compiled: cheapest_pairs(near, costs.clone(), len(first), compiled=compiled),
         "replacement": lambda compiled: replace_pairs(state, first, second, MERGING, compiled),

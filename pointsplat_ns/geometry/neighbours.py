@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
+from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.threads import most_threads
 
 if TYPE_CHECKING:
@@ -85,15 +86,17 @@ def other_neighbours(points: Tensor, k: int, compiled: bool | None = None) -> Te
         near, walk = tree.others(k), tree.order
     else:
         near, walk = _others_by_scipy(points, k)
-    crowd = (near[:, k - 1] >= 0).nonzero()[:, 0]
-    crowd = crowd[(points[near[crowd, k - 1].long()] == points[crowd]).all(1)]
+    own = torch.arange(len(points), dtype=torch.int32)
+    same = [
+        (last >= 0) & (points[last.long()] == points[these]).all(1)
+        for last, these in zip(near[:, k - 1].split(CHUNK), own.split(CHUNK), strict=True)
+    ]
+    crowd = torch.cat(same).nonzero()[:, 0] if same else own.long()
     if len(crowd):
         before, after = torch.empty_like(walk), torch.empty_like(walk)
         before[walk], after[walk] = walk.roll(1), walk.roll(-1)
         near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
-    none = (near < 0).nonzero(as_tuple=True)
-    near[none] = none[0].to(torch.int32)
-    return near
+    return near.where(near >= 0, own[:, None]) if bool((near[:, -1] < 0).any()) else near
 
 
 def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import sys
 from pathlib import Path
@@ -24,6 +25,13 @@ def share_freed_memory() -> bool:
     that was freed there serves no other. Threads that exist keep theirs. Without Linux and glibc, nothing is changed.
     """
     return _set({-8: 2})  # M_ARENA_MAX: enough for a thread that draws and the others
+
+
+def give_back_freed_memory() -> None:
+    """Return freed memory to the system, between stages of long work that need it in blocks of other sizes: else what
+    lies free between blocks counts as taken. Without Linux and glibc, nothing happens."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _set(values: dict[int, int]) -> bool:
@@ -50,12 +58,12 @@ class PeakMemory:
 
     def __init__(self) -> None:
         self._known = False
+        give_back_freed_memory()
         try:
-            ctypes.CDLL(None).malloc_trim(0)
             Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark to what is resident now
             self._known = True
         except (OSError, AttributeError, TypeError):
-            pass  # another system or C library
+            pass  # another system
 
     def bytes(self) -> int | None:
         """The peak so far; None where it cannot be known."""

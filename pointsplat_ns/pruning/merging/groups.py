@@ -24,6 +24,11 @@ class Groups:
     alphas: Tensor  # [K] float64
     counts: Tensor  # [K] int32, number of members
 
+    @classmethod
+    def of(cls, state: State, group: Tensor, shares: Tensor, first: Tensor) -> Groups:
+        """The groups that became the Gaussians of a state."""
+        return cls(group, shares, first, *state.in_scene_units(), state.alphas.double(), state.counts)
+
     def __len__(self) -> int:
         return len(self.means)
 
@@ -45,7 +50,7 @@ def merged_groups(participants: Participants, state: State, tree: Tree) -> Group
     """The groups of the rounds so far, in the order of the state."""
     group = tree.groups()
     first = first_members(participants, group, len(state))
-    return Groups(group, tree.shares(), first, state.means, state.cov, state.alphas, state.counts)
+    return Groups.of(state, group, tree.shares(), first)
 
 
 def first_members(participants: Participants, group: Tensor, count: int) -> Tensor:

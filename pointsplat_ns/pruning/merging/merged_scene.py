@@ -22,7 +22,6 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
     is that member to the bit."""
     scene, counts = participants.scene, groups.counts.double()
     single = (counts == 1)[:, None]
-    sh = _mean_sh(participants, groups, single[:, 0])
     log_scales, quats = _axes(groups.cov, scene.dtype)
     means = torch.where(single, scene.means[groups.first], groups.means.to(scene.dtype))
     quats = torch.where(single, scene.quats[groups.first], quats)
@@ -30,7 +29,10 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
     alphas = deepened(groups.alphas, counts, settings.depth_exponent, settings.max_opacity)
     logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
 
-    own_scales, opacities = scene.scales[groups.first], torch.where(single, scene.opacities[groups.first], logits)
+    first, group, shares = groups.first, groups.group, groups.shares
+    del groups
+    sh = _mean_sh(participants, group, shares, single[:, 0])
+    own_scales, opacities = scene.scales[first], torch.where(single, scene.opacities[first], logits)
 
     def make(size_change: float) -> Gaussians:
         scales = torch.where(single, own_scales, (log_scales + size_change).to(scene.dtype))
@@ -46,17 +48,17 @@ def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float
     return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
 
 
-def _mean_sh(participants: Participants, groups: Groups, single: Tensor) -> tuple[Tensor, Tensor]:
-    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by mass. Those of a group of one,
-    ``single`` (K,), are its own to the bit."""
-    scene, group = participants.scene, groups.group
+def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: Tensor) -> tuple[Tensor, Tensor]:
+    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by their ``shares`` (n,) of their groups
+    (n,). Those of a group of one, ``single`` (K,), are its own to the bit."""
+    scene = participants.scene
     wide = torch.promote_types(scene.dtype, torch.float32)
     means = []
     for values in (scene.features_dc, scene.features_rest):
-        mean = torch.zeros(len(groups), *values.shape[1:], dtype=wide)
+        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide)
         for rows in torch.arange(len(group)).split(CHUNK):
             own = values[participants.members[rows]].to(wide)
-            mean.index_add_(0, group[rows], own * groups.shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
+            mean.index_add_(0, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
             of_single = single[group[rows]]
             mean[group[rows][of_single]] = own[of_single]
         means.append(mean.to(scene.dtype))
@@ -69,6 +71,8 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     for rows in torch.arange(len(cov)).split(CHUNK):
         variances, axes = torch.linalg.eigh(unpack(cov[rows]))
         axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
-        scales[rows] = 0.5 * variances.clamp_min(MIN_DIVISOR).log()
+        # as covariances(): rounding leaves nothing of what is thinner
+        variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
+        scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
     return scales, quats

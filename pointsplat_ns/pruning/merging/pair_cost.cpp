@@ -29,9 +29,8 @@ struct Costs {
     Planes planes;
     Limits limits;
     Contrasts contrasts;
-    double centre[3], size;
-    const double *means, *cov, *alphas;  // [n, 3], [n, 6], [n]
-    const float *colours, *weights;      // [n, axes], [n]
+    const float *means, *cov, *alphas;  // [n, 3], [n, 6], [n]
+    const float *colours, *weights;     // [n, axes], [n]
     int64_t count, axes, neighbours;
     float* table;         // [n, 12] of pointsplat_projected
     const int32_t* near;  // [n, neighbours]
@@ -112,19 +111,19 @@ inline Lane overlap_of_sum(Lane uu, Lane uv, Lane vv, Lane areas, Lane u, Lane v
 
 extern "C" {
 
-// Means and covariances in units of the content, within the bounds, and the direction in which each is largest.
+// Means and covariances within the bounds, and the direction in which each is largest.
 void pointsplat_projected(const Costs* task, int64_t* next) {
     const Costs& c = *task;
-    const double most = c.limits.max_width * c.limits.max_width, area = c.size * c.size;
+    const double most = c.limits.max_width * c.limits.max_width;
     each_range(next, c.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             float* row = c.table + TABLE * i;
             for (int d = 0; d < 3; ++d) {
-                const double at = (c.means[3 * i + d] - c.centre[d]) / c.size;
+                const double at = c.means[3 * i + d];
                 row[d] = static_cast<float>(std::min(std::max(at, -c.limits.max_coordinate), c.limits.max_coordinate));
             }
             double cov[6];
-            for (int d = 0; d < 6; ++d) cov[d] = c.cov[6 * i + d] / area;
+            for (int d = 0; d < 6; ++d) cov[d] = c.cov[6 * i + d];
             const double shrink = most / std::max(cov[0] + cov[3] + cov[5], most);
             for (int d = 0; d < 6; ++d) cov[d] *= shrink, row[3 + d] = static_cast<float>(cov[d]);
             int best = 0;

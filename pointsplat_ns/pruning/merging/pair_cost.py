@@ -73,7 +73,7 @@ def pair_costs(
     """
     # the largest numbers of neighbours and of colour axes that the kernel is made for
     fits = near.shape[1] <= 32 and state.colours.shape[1] <= 16 and near.dtype == torch.int32
-    if fits and dtype == torch.float32 and KERNELS.usable(compiled):
+    if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
     n = len(state)
     directions = torch.empty(n, 3, dtype=torch.uint8)
@@ -235,10 +235,10 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     costs = torch.empty(near.shape, dtype=torch.float32)
     limits = KERNELS.structs["Limits"](**vars(PROJECTION_LIMITS))
     task = KERNELS.structs["Costs"](
-        planes=_planes(), limits=limits, contrasts=_contrasts(settings), centre=tuple(state.centre.tolist()),
-        size=state.size, means=state.means, cov=state.cov, alphas=state.alphas, colours=state.colours.contiguous(),
-        weights=state.weights, count=count, axes=state.colours.shape[1], neighbours=near.shape[1],
-        table=torch.empty(count, 12, dtype=torch.float32), near=near.contiguous(), costs=costs,
+        planes=_planes(), limits=limits, contrasts=_contrasts(settings), means=state.means, cov=state.cov,
+        alphas=state.alphas, colours=state.colours.contiguous(), weights=state.weights, count=count,
+        axes=state.colours.shape[1], neighbours=near.shape[1], table=torch.empty(count, 12, dtype=torch.float32),
+        near=near.contiguous(), costs=costs,
     )  # fmt: skip
     for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
         on_threads(count >= SEVERAL, function, task, threads=most_threads())
@@ -264,12 +264,12 @@ def _as_torch() -> bool:
     def random(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 
-    factors = 0.2 * random(count, 3, 3).double()
+    factors = 0.1 * random(count, 3, 3)
     cov = (factors @ factors.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     state = State(
-        means=random(count, 3).double(), cov=cov, alphas=random(count).double(), colours=random(count, 5),
+        means=random(count, 3) - 0.5, cov=cov, alphas=random(count), colours=random(count, 5),
         weights=random(count), counts=torch.ones(count, dtype=torch.int32),
-        centre=torch.full((3,), 0.5, dtype=torch.float64), size=1.3,
+        centre=torch.zeros(3, dtype=torch.float64), size=1.0,
     )  # fmt: skip
     near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32)
     ours, torchs = _by_kernels(state, near, MERGING), pair_costs(state, near, compiled=False)

@@ -76,13 +76,11 @@ PLANE_AXES, TO_PLANE = _projection_matrices()
 TRIPLES = _perpendicular_triples()
 
 
-def in_content_units(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
+def within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Means (m, 3) and covariances (m, 6) of some Gaussians in units of the content's size, around its centre, within
-    the bounds."""
-    means = ((state.means[rows] - state.centre) / state.size).clamp_(
-        -PROJECTION_LIMITS.max_coordinate, PROJECTION_LIMITS.max_coordinate
-    )
-    cov = state.cov[rows] / state.size**2
+    the bounds, float64."""
+    most = PROJECTION_LIMITS.max_coordinate
+    means, cov = state.means[rows].double().clamp_(-most, most), state.cov[rows].double()
     total = cov[:, 0] + cov[:, 3] + cov[:, 5]
     cov *= (PROJECTION_LIMITS.max_width**2 / total.clamp_min(PROJECTION_LIMITS.max_width**2))[:, None]
     return means, cov
@@ -91,7 +89,7 @@ def in_content_units(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
 def directions_of(state: State, rows: Tensor) -> Tensor:
     """Indices (m, 3) of the directions in which some Gaussians are compared with their neighbours: that in which the
     projection is largest, and two across."""
-    _, cov = in_content_units(state, rows)
+    _, cov = within_bounds(state, rows)
     flat = (cov @ TO_PLANE.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
     squared_areas = flat[..., 0] * flat[..., 2] - flat[..., 1] ** 2
     return TRIPLES[squared_areas.argmax(1)]
@@ -113,7 +111,7 @@ class Projections:
 
     def fill(self, state: State, rows: Tensor, direction: int) -> None:
         """Project some Gaussians along a direction, by its index."""
-        means, cov = in_content_units(state, rows)
+        means, cov = within_bounds(state, rows)
         centres = (means @ PLANE_AXES[direction]).to(self.table)
         flat = (cov @ TO_PLANE[direction]).to(self.table)
         added = PROJECTION_LIMITS.roundness * (flat[:, 0] + flat[:, 2]) + PROJECTION_LIMITS.min_width**2

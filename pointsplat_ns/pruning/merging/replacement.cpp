@@ -1,16 +1,16 @@
 // What pairs become, and the Gaussians that stay as they are.
 //
 // replacement.py compiles this file where there is a C++ compiler and calls it. It and covariance.py do the same in torch,
-// say where the formulas are from, and have the names that are used here. All of it is float64, as there.
+// say where the formulas are from, and have the names that are used here. All of it is computed in float64, as there.
 
 #include "lanes.h"
 
 extern "C" {
 
 struct Remaining {
-    double *means, *cov, *alphas;  // [n, 3], [n, 6], [n]
-    float *colours, *weights;      // [n, axes], [n]
-    int32_t* counts;               // [n]
+    float *means, *cov, *alphas;  // [n, 3], [n, 6], [n]
+    float *colours, *weights;     // [n, axes], [n]
+    int32_t* counts;              // [n]
 };
 
 struct Replacing {
@@ -85,7 +85,7 @@ inline double overlap(const Flat& first, const Flat& second, double u, double v,
     return std::min(one, other) * within * std::exp(-0.5 * std::max(distance, 0.0));
 }
 
-inline Six load(const double* from) { return {from[0], from[1], from[2], from[3], from[4], from[5]}; }
+inline Six load(const float* from) { return {from[0], from[1], from[2], from[3], from[4], from[5]}; }
 
 // Writes a pair's mean, covariance and opacity, and gives the share of the first member.
 double replace(const Replacing& r, int64_t i, int64_t j, int64_t place) {
@@ -93,9 +93,9 @@ double replace(const Replacing& r, int64_t i, int64_t j, int64_t place) {
     const Six si = load(b.cov + 6 * i), sj = load(b.cov + 6 * j);
     const double ai = b.alphas[i], aj = b.alphas[j], mi = ai * rms_area(si), mj = aj * rms_area(sj), total = mi + mj;
     const double wi = total > r.min_divisor ? mi / total : 0.5, wj = 1 - wi, both = wi * wj;
-    const double *from = b.means + 3 * i, *to = b.means + 3 * j;
-    const Vector apart = {from[0] - to[0], from[1] - to[1], from[2] - to[2]};
-    for (int d = 0; d < 3; ++d) r.after.means[3 * place + d] = wi * from[d] + wj * to[d];
+    const float *from = b.means + 3 * i, *to = b.means + 3 * j;
+    const Vector apart = {double(from[0]) - to[0], double(from[1]) - to[1], double(from[2]) - to[2]};
+    for (int d = 0; d < 3; ++d) r.after.means[3 * place + d] = static_cast<float>(wi * from[d] + wj * to[d]);
     const Six cov = {
         wi * si.xx + wj * sj.xx + both * (apart.x * apart.x), wi * si.xy + wj * sj.xy + both * (apart.x * apart.y),
         wi * si.xz + wj * sj.xz + both * (apart.x * apart.z), wi * si.yy + wj * sj.yy + both * (apart.y * apart.y),
@@ -111,8 +111,8 @@ double replace(const Replacing& r, int64_t i, int64_t j, int64_t place) {
     const double needed = std::min(std::max(alpha / r.max_opacity, 1.0), r.max_growth_ratio);
     const double growth = needed > 1.0 ? std::pow(needed, r.growth_exponent) : 1.0;
     const double six[6] = {cov.xx, cov.xy, cov.xz, cov.yy, cov.yz, cov.zz};
-    for (int d = 0; d < 6; ++d) r.after.cov[6 * place + d] = six[d] * growth;
-    r.after.alphas[place] = std::min(alpha, r.max_opacity);
+    for (int d = 0; d < 6; ++d) r.after.cov[6 * place + d] = static_cast<float>(std::min(std::max(six[d] * growth, -1e30), 1e30));
+    r.after.alphas[place] = static_cast<float>(std::min(alpha, r.max_opacity));
     return wi;
 }
 

@@ -34,6 +34,7 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
 from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
+from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -186,6 +187,7 @@ def _levels(
                 step = first_step(copies.reduced(left), views, settings)
         if k == last:
             del copies
+        give_back_freed_memory()
         while len(step.state) > k:
             with one_thread_each():
                 step = one_round(step, k, settings)
@@ -257,7 +259,8 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     participants, viewpoints = step.participants, step.viewpoints
     n = len(step.state)
     most = min(n - k, most_pairs(n, settings))
-    near = other_neighbours(step.state.means, settings.neighbours)
+    near = other_neighbours(step.state.means.double(), settings.neighbours)
+    give_back_freed_memory()
     first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
     del near
     state, shares = replace_pairs(step.state, first, second, settings)
@@ -287,16 +290,18 @@ def finished(
     groups = merged_groups(participants, step.state, step.tree)
     if last:
         del step.state, step.tree
+    give_back_freed_memory()
     any_merged = groups.any_merged
     if regroup and any_merged and settings.regrouping_rounds > 0:
         group, areas, alphas = groups.group, areas_of(groups.cov), groups.alphas
         del groups
         groups = regrouped(participants, group, areas, alphas, settings)
         del group
-    groups = groups.in_order()
-    make = scene_maker(participants, groups, settings)
-    group = groups.group
+    ordered = [groups.in_order()]
     del groups
+    group = ordered[0].group
+    make = scene_maker(participants, ordered.pop(), settings)  # which lets go of what it has used
+    give_back_freed_memory()
     finish = Finish()
     if reference is not None and any_merged:
         finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))), settings)

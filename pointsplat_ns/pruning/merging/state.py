@@ -16,13 +16,21 @@ from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 
 
+def bounded(cov: Tensor) -> Tensor:
+    """Covariances that float32 can hold."""
+    return cov.clamp(-1e30, 1e30)
+
+
 @dataclass(frozen=True, eq=False)
 class State:
-    """The Gaussians that remain after some rounds."""
+    """The Gaussians that remain after some rounds.
 
-    means: Tensor  # [n, 3] float64, scene units
-    cov: Tensor  # [n, 6] float64, squared scene units
-    alphas: Tensor  # [n] float64
+    Costs are of float32, and the shapes of groups are computed anew at the end, so that more digits would not show.
+    """
+
+    means: Tensor  # [n, 3] float32, around the centre, in units of the size
+    cov: Tensor  # [n, 6] float32, in units of the squared size, see :func:`bounded`
+    alphas: Tensor  # [n] float32
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
     counts: Tensor  # [n] int32, number of Gaussians that each stands for
@@ -33,6 +41,10 @@ class State:
     def __len__(self) -> int:
         return len(self.means)
 
+    def in_scene_units(self) -> tuple[Tensor, Tensor]:
+        """Means (n, 3) and covariances (n, 6) in scene units, float64."""
+        return self.means.double() * self.size + self.centre, self.cov.double() * self.size**2
+
 
 class ColourAxes(NamedTuple):
     """Axes on which colours are compared."""
@@ -42,7 +54,11 @@ class ColourAxes(NamedTuple):
 
 
 def initial_state(
-    participants: Participants, weights: Tensor, settings: MergeSettings, axes: ColourAxes | None = None
+    participants: Participants,
+    weights: Tensor,
+    settings: MergeSettings,
+    axes: ColourAxes | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> State:
     """The state before the first round.
 
@@ -51,17 +67,19 @@ def initial_state(
         weights: (n,) visibility weight of each per unit of area.
         settings: ``colour_axes`` and ``max_colour``.
         axes: of the colours; by default the principal axes of the participants.
+        dtype: float64 for a reference, which kernels do not take.
     """
     scene, members = participants.scene, participants.members
+    centre, size = participants.centre.double(), participants.size
     return State(
-        means=scene.means[members].double(),
-        cov=covariances_of(scene, members),
-        alphas=torch.sigmoid(scene.opacities[members, 0]).double(),
+        means=in_pieces(lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype),
+        cov=in_pieces(lambda rows: bounded(covariances_of(scene, rows) / size**2), members, 6, dtype=dtype),
+        alphas=torch.sigmoid(scene.opacities[members, 0]).to(dtype),
         colours=_on_axes(scene, members, axes or principal_axes(scene, members, settings), settings),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32),
-        centre=participants.centre.double(),
-        size=participants.size,
+        centre=centre,
+        size=size,
     )
 
 

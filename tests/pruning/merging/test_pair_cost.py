@@ -78,8 +78,8 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     got = cost_along_z(scene)
     axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
-    cov = algebra.unpack(state.cov)[:, :2, :2]
-    means, alphas = state.means[:, :2], state.alphas
+    cov = algebra.unpack(state.cov.double())[:, :2, :2]
+    means, alphas = state.means[:, :2].double(), state.alphas.double()
     areas = torch.linalg.det(cov).sqrt()
 
     def splat(mean, cov):

@@ -172,7 +172,7 @@ class _Work:
         may be merged next."""
         with one_thread_each():
             state, group = self._state(number, cell)
-            near = other_neighbours(state.means, self.settings.neighbours)
+            near = other_neighbours(state.means.double(), self.settings.neighbours)
             costs = pair_costs(state, near, self.settings)
             first, second, prices = candidate_pairs(near, costs, self.settings.matching_passes)
         pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
@@ -228,7 +228,7 @@ class _Work:
             state, group = self._state(rounds, cell)
             participants = self._participants(cell)
             first = first_members(participants, group, len(state))
-            groups = Groups(group, torch.ones(len(group)), first, state.means, state.cov, state.alphas, state.counts)
+            groups = Groups.of(state, group, torch.ones(len(group)), first)
             del state
             if groups.any_merged:
                 groups = regrouped(participants, group, areas_of(groups.cov), groups.alphas, self.settings)
