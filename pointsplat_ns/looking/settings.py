@@ -161,10 +161,10 @@ class LookingSettings:
     """Thickness of the slabs in which points are counted by height, units; two neighbours hold one level surface."""
 
     usual_axis_factors: tuple[float, float] = (1.32, 1.25)
-    """Factor of the uprightness of the world's axes, as most files stand along one, and a further one of y, as most have
-    -y up; (0, 1) turns the rule off. 18 files and the example room, turned so that up lies on each of six directions,
-    stand along the right axis in 100 cases of 114. With (1.32, 1), two rooms whose walls are as flat as their floors
-    are always wrong, also as they come, and all others right. With photo places, better evidence, it is (1.05, 1)."""
+    """Factor of the uprightness of the world's axes, as most files stand along one, and a further one of y, as most
+    have -y up; (0, 1) turns the rule off. 18 files and the example room, turned so that up lies on each of six
+    directions, stand along the right axis in 100 cases of 114. With (1.32, 1), two rooms whose walls are as flat as
+    their floors are always wrong, also as they come, and all others right. With photo places it is (1.05, 1)."""
 
     photo_level_weight: float = 0.1
     """Weight of the levelness of photo places in the uprightness; 0 turns it off. For a desk that was walked around,

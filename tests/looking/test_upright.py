@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.api import example_room
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import turning
 from pointsplat_ns.looking.content import content_size
