@@ -33,7 +33,7 @@ from pointsplat_ns.views import Views
 class MemorySettings:
     """Memory that merging takes, and the sizes of cells that follow from it."""
 
-    whole: int = 600
+    whole: int = 400
     """Bytes for each Gaussian of a scene in memory, beside the scene itself."""
     cell: int = 400
     """Bytes for each Gaussian of a cell: what follows from the whole scene is known before."""
@@ -142,7 +142,7 @@ def prune_file(
     work = {
         "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
         "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
-        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING),
+        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING), "state": "float32",
     }  # fmt: skip
 
     def views(sample: Gaussians) -> Views | None:

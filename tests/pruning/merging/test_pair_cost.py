@@ -240,3 +240,20 @@ def test_the_overlap_is_the_integral_of_the_product(first, second, apart):
     integral = float((splat(first, 0.0) * splat(second, apart)).sum()) * 0.05**2 / (2 * math.pi)
     u, v = apart[:, None]
     assert overlap(first[None], second[None], u, v).item() == pytest.approx(integral, rel=1e-9)
+
+
+@needs_compiler
+def test_covariances_by_the_kernel_are_those_of_torch_also_at_the_extremes():
+    g = torch.Generator().manual_seed(5)
+    scene = cloud(5000)
+    scales, quats = scene.scales.clone(), scene.quats.clone()
+    scales[:500] = 60 * torch.randn(500, 3, generator=g)
+    scales[500:600, 2], scales[600:610] = -math.inf, -math.inf
+    quats[:400] *= 1e-20
+    quats[400:700] = 0.0
+    quats[700:800] *= 1e18
+    scene, rows = scene.replace(scales=scales, quats=quats), torch.randperm(5000, generator=g)[:4500]
+    found, torchs = (algebra.covariances_of(scene, rows, compiled) for compiled in (True, False))
+    assert bool(found.isfinite().all())
+    assert float(((found - torchs).abs() / torchs.abs().amax(1, keepdim=True)).max()) < 1e-13  # float64
+    assert_same_on_any_threads(lambda: [algebra.covariances_of(scene, rows)])
