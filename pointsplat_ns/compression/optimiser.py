@@ -5,6 +5,7 @@ The loss of a view is that of 3DGS: 0.8 L1 + 0.2 (1 - SSIM).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -142,6 +143,24 @@ def extent(scene: Gaussians) -> float:
     means = scene.means.detach().double()
     with one_thread():
         return float((means - means.median(0).values).norm(dim=1).quantile(0.9)) or 1.0
+
+
+@torch.no_grad()
+def size_factors(scene: Gaussians, reach: float) -> Tensor:
+    """Factors for :meth:`Adam.moves` that make the rate of the means a share of a Gaussian's own size: of its middle
+    standard deviation. The other rates stay.
+
+    Args:
+        scene: K Gaussians.
+        reach: extent of the scene when ``Adam`` was made, scene units; a larger size counts as this.
+
+    Returns:
+        (K, 6).
+    """
+    factors = scene.means.new_ones(len(scene), len(RATES))
+    middle = scene.scales.median(dim=1).values.clamp(max=math.log(reach))
+    factors[:, list(RATES).index("means")] = (middle - math.log(reach)).exp().nan_to_num(0.0)
+    return factors
 
 
 def gradients_of(

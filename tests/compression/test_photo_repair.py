@@ -1,6 +1,7 @@
 """Training a smaller scene on photos: what it gains where no step looked, which pixels count, and how it ends."""
 
 import dataclasses
+import math
 import random
 
 import pytest
@@ -9,7 +10,15 @@ import torch
 import pointsplat_ns as ps
 from making import FewViews
 from pointsplat_ns.compression import photo_repair as module
-from pointsplat_ns.compression.optimiser import Example, gradients_of
+from pointsplat_ns.compression.optimiser import (
+    RATES,
+    Adam,
+    AdamSettings,
+    Example,
+    extent,
+    gradients_of,
+    size_factors,
+)
 from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair
 from pointsplat_ns.compression.requests import PHOTO_STEPS, PhotoBudget
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
@@ -80,6 +89,27 @@ def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
 def test_one_photo_is_too_few(hollow_ball, pruned, photos):
     with pytest.raises(DataError, match="1 photos to train on; expected at least two"):
         photo_repair(pruned, hollow_ball, photos[:1], FewViews(hollow_ball), PhotoBudget("quick"))
+
+
+def test_gaussians_move_by_a_share_of_their_own_size(hollow_ball, pruned, photos):
+    """The same steps in scenes of any scale, and next to none where a size is none."""
+    adam = Adam(pruned, AdamSettings(), {**RATES, "means": 0.25})
+    adam.observe(gradients_of(pruned, *photos[0]))
+    moves = adam.moves(1.0, size_factors(pruned, extent(pruned)))["means"].abs()
+    middle = pruned.scales.exp().median(dim=1).values
+    seen = moves.amax(1) > 0
+    assert int(seen.sum()) > 50
+    assert torch.allclose(moves.amax(1)[seen], 0.25 * middle[seen], rtol=1e-4)  # Adam's first step has length 1
+
+
+def test_sizes_at_their_extremes_move_nothing_to_infinity(pruned):
+    logs = [(-math.inf, -math.inf, -2.0), (-200.0, -150.0, 0.0), (-1e-3, 0.0, 88.0), (300.0, 200.0, 100.0)]
+    scales = torch.tensor([*logs, (math.inf,) * 3, (math.nan,) * 3])
+    scene = pruned[: len(scales)].replace(scales=scales)
+    shares = [size_factors(scene.map(lambda value, to=to: value.to(to)), 4.0) for to in (torch.float32, torch.float64)]
+    assert shares[0][:, 1:].eq(1).all()
+    assert torch.allclose(shares[0].double(), shares[1], rtol=1e-5, atol=1e-30)
+    assert shares[1][:, 0].tolist() == pytest.approx([0.0, math.exp(-150) / 4, 0.25, 1.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("generator", [None, random.Random(3)])
