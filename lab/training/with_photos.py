@@ -7,7 +7,8 @@
 A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
 held-out photos, at the size of the photos. Each way is a process of its own, whose CPU seconds count, with starting and
 reading. ``compact --photos`` says how many seconds the others get: training on photos after pruning by a score takes as
-long; so does a training with a cap from the start, and a second one takes as long as the dense training besides.
+long; so does a training with a cap from the start, and a second one takes as long as the dense training besides. A long
+``compact --photos`` trains on photos for as many seconds of the clock as the dense training took of the processor.
 Finished rows are not measured again.
 """
 
@@ -39,8 +40,8 @@ from pointsplat_ns.system.programs import run_measured
 DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, short", "cap, long"
 """Names of the dense scene and of trainings with a cap: without and with the seconds of the dense training."""
 
-COMPACTED = "compact --photos"
-"""The way that says how many seconds the others get."""
+COMPACTED, COMPACTED_LONG = "compact --photos", "compact --photos, long"
+"""The way that says how many seconds the others get; and the same with as many seconds as the dense training took."""
 
 WAYS: dict[str, list[str]] = {
     "prune": ["prune"],
@@ -52,7 +53,7 @@ WAYS: dict[str, list[str]] = {
 SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, trained on"}
 """Scores of prune that training on photos follows, and the names of these ways."""
 
-METHODS = (DENSE, *WAYS, *SCORES.values(), CAP_SHORT, CAP_LONG)
+METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
 """All ways, in the order of the tables."""
 
 _POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import program; program()")
@@ -139,6 +140,9 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row]) -> It
             if (keep, method) not in there:
                 there[keep, method] = capture.row(keep, method, *capture.reduced([*_POINTSPLAT, *words], count), True)
                 yield there[keep, method]
+        if (keep, COMPACTED_LONG) not in there:
+            command = [*_POINTSPLAT, *WAYS[COMPACTED], "--seconds", f"{dense['cpu_seconds']:.0f}"]
+            yield capture.row(keep, COMPACTED_LONG, *capture.reduced(command, count), True)
         seconds = there[keep, COMPACTED]["cpu_seconds"]
         for by, method in SCORES.items():
             if (keep, method) not in there:

@@ -45,11 +45,12 @@ def test_all_ways_are_measured_and_trainings_with_a_cap_take_as_long_as_the_othe
     assert [found["method"] for found in rows] == list(METHODS)
     assert capture.asked[0] == ("dense", 2000, None) and rows[0]["cpu_seconds"] == 1010
     assert ("compact", "--photos", 100) in capture.asked
+    assert ("compact", "--photos", "--seconds", "1010", 100) in capture.asked
     assert ("lightgaussian", "60.0", 100) in capture.asked and ("pup", "60.0", 100) in capture.asked
     short, long = rows[-2:]
     assert short["cpu_seconds"] == pytest.approx(60, abs=0.1) and long["cpu_seconds"] == pytest.approx(1070, abs=0.1)
     assert capture.asked[-1] == ("cap-100-10599", 10599, 100)
-    assert [found["needs_dense"] for found in rows] == [False] + [True] * 5 + [False] * 2
+    assert [found["needs_dense"] for found in rows] == [False] + [True] * 6 + [False] * 2
 
 
 def test_training_on_photos_ends_when_it_has_used_its_cpu_seconds():
