@@ -14,14 +14,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, cast
+from typing import BinaryIO, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.formats import FORMATS
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".ckpt")
 """Ends of the names of files that may be dropped."""
@@ -150,7 +147,7 @@ class Served:
         """End the server and all drawing. A second call does nothing."""
         raise NotImplementedError
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Served:
         return self
 
     def __exit__(self, *error: object) -> None:
