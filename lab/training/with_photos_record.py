@@ -28,8 +28,8 @@ of the training with a cap are chosen on them.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 400 steps. "{COMPACTED_LONG}" trains on
   them for as many seconds (`--seconds`) as the dense training took.
 - "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
-  them on the photos as `{COMPACTED}` does, for at most as many CPU seconds as `{COMPACTED}` takes in all. The methods'
-  own schedules are longer.
+  them on the photos as `{COMPACTED}` does, for as many CPU seconds as `{COMPACTED}` takes in all; reading and
+  scores come on top. The methods' own schedules are longer.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
   seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - The machine was busy: CPU seconds of equal work differ by up to a half.
