@@ -25,8 +25,7 @@ from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.viewing.page_server import PageServer
-    from pointsplat_ns.viewing.viewer import Viewer
+    from pointsplat_ns.viewing.server import Served
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -118,7 +117,7 @@ def open_viewer(
     up: str | None = None,
     host: str = "127.0.0.1",
     port: int = 7007,
-) -> Viewer | PageServer:
+) -> Served:
     """Show a scene, or two scenes with the same camera, in the browser. This machine's processor draws; no GPU is
     needed.
 

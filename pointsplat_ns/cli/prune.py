@@ -103,7 +103,7 @@ def prune(
     from pointsplat_ns.errors import PointSplatError, SceneError
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.scene import is_folder_of_scenes
-    from pointsplat_ns.system.processes import connect_torchrun, together, torchrun_rank
+    from pointsplat_ns.system.processes import by_first, connect_torchrun, world_size
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
@@ -121,14 +121,13 @@ def prune(
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
     connect_torchrun()
-    rank, processes = torchrun_rank()
-    together(lambda: claim_outputs(written, force, plot) if rank == 0 else None)
+    by_first(lambda: claim_outputs(written, force, plot))
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune).in_format(format_to_write(output))
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
-    if processes > 1 and (rows is None or memory is None):
+    if world_size() > 1 and (rows is None or memory is None):
         raise PointSplatError(
-            f"{scene}: {processes} processes share the parts of a scene larger than --memory; expected one process, or "
-            "a --memory that the scene does not fit into"
+            f"{scene}: {world_size()} processes share the parts of a scene larger than --memory; expected one process, "
+            "or a --memory that the scene does not fit into"
         )
     if rows is not None:
         if dry_run or plot is not None:

@@ -54,8 +54,9 @@ class Adam:
     """
 
     def __init__(self, scene: Gaussians, settings: AdamSettings, rates: Mapping[str, float] = RATES):
-        reach = extent(scene)
-        self.rates = {name: settings.faster * rates[name] * (reach if name == "means" else 1.0) for name in RATES}
+        self.reach = extent(scene)
+        """Extent of the scene at the start, scene units."""
+        self.rates = {name: settings.faster * rates[name] * (self.reach if name == "means" else 1.0) for name in RATES}
         self._settings = settings
         self._first = {name: torch.zeros_like(value) for name, value in scene.items()}
         self._second = {name: torch.zeros_like(value) for name, value in scene.items()}

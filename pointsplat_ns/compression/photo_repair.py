@@ -16,7 +16,7 @@ from itertools import count as counted
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, optimised, size_factors
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised, size_factors
 from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
@@ -120,10 +120,10 @@ def photo_repair(
                 best, after = scene, psnr
 
     rates = {**RATES, "means": PHOTO_REPAIR.means_rate}
-    adam, reach = Adam(scene, AdamSettings(faster=PHOTO_REPAIR.faster), rates), extent(scene)
+    adam = Adam(scene, AdamSettings(faster=PHOTO_REPAIR.faster), rates)
 
     def choose(scene: Gaussians) -> tuple[float, Tensor]:
-        return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, reach)
+        return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
 
     run.take(optimised(scene, adam, _examples(photos, used, dense, views), choose), compare, progress)
     return PhotoRepaired(best, before, after, len(used), len(unseen), run.count, run.seconds, run.interrupted)

@@ -101,10 +101,15 @@ def together(work: Callable[[], object]) -> None:
             raise PointSplatError(f"process {number} of {len(texts)} failed: {text}")
 
 
+def by_first(work: Callable[[], object]) -> None:
+    """Let the first process do a work, while the others wait. Errors as of :func:`together`."""
+    together(lambda: work() if rank() == 0 else None)
+
+
 def first_alone(make: Callable[[], Result]) -> Result:
     """What ``make`` gives in each process; the first one calls it before the others, which find what it left."""
     made: list[Result] = []
-    together(lambda: made.append(make()) if rank() == 0 else None)
+    by_first(lambda: made.append(make()))
     return made[0] if made else make()
 
 

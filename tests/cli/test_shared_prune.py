@@ -7,22 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from killing import KILLED_AFTER_STEPS
 from making import normal_scene, quick_start
 from pointsplat_ns.io import write_ply
 
-PRUNE = """
-import os, signal, sys
+PROGRAM = """
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import prune_file
 prune_file.MEMORY = prune_file.MemorySettings(base=0, least=100)
-folder, output, killed_at, memory = sys.argv[1], sys.argv[2], int(sys.argv[3]), sys.argv[4]
-left = [killed_at]
-def heard(event, args):
-    if event == "os.rename" and "cells" in str(args[1]):
-        left[0] -= 1
-        if left[0] == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-sys.addaudithook(heard)
+folder, output, memory = sys.argv[1], sys.argv[2], sys.argv[4]
+killed_after_steps(int(sys.argv[3]))
 main(["prune", f"{folder}/scene.ply", "--keep", "10%", "--memory", memory, "-o", f"{folder}/{output}"])
 """
 
@@ -30,7 +24,7 @@ main(["prune", f"{folder}/scene.ply", "--keep", "10%", "--memory", memory, "-o",
 def pruned(folder: Path, output: str, processes: int, killed_at: int = 0, memory: str = "100kB") -> tuple[int, str]:
     """Exit status and text of a command in so many processes, each killed after some steps unless that is 0."""
     program = folder / "prune.py"
-    program.write_text(PRUNE)
+    program.write_text(KILLED_AFTER_STEPS + PROGRAM)
     start = ("-m", "torch.distributed.run", "--nproc-per-node", f"{processes}") if processes > 1 else ()
     done = subprocess.run(
         [sys.executable, *start, str(program), str(folder), output, f"{killed_at}", memory],

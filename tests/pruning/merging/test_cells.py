@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from killing import KILLED_AFTER_STEPS
 from making import assert_same_on_any_threads, box_room, cloud, same_bits
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
@@ -105,20 +106,13 @@ def test_any_number_of_threads_gives_the_same_bits(tmp_path):
 
 
 KILLED = """
-import os, signal, sys
 from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
-here, at = Path(sys.argv[1]), int(sys.argv[2])
-left = [at]
-def heard(event, args):
-    if event == "os.rename" and "cells" in str(args[1]):
-        left[0] -= 1
-        if left[0] == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-sys.addaudithook(heard)
+here = Path(sys.argv[1])
+killed_after_steps(int(sys.argv[2]))
 rows = PlyRows.open(here / "scene.ply")
 blind = replace(MERGING, min_count_rendered=10**9)
 merge_file(rows, lambda n: 300, here / "small.ply", 1000, Scratch(here / "cells", {"a": 1}), settings=blind)
@@ -132,14 +126,18 @@ def test_killed_and_started_again_it_goes_on_to_the_same_bytes(tmp_path):
     wanted = (tmp_path / "small.ply").read_bytes()
     (tmp_path / "small.ply").unlink()
     for at in (4, 9):
-        done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), str(at)], capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-c", KILLED_AFTER_STEPS + KILLED, str(tmp_path), str(at)], capture_output=True, text=True
+        )
         assert done.returncode in (0, -9), done.stderr
         if done.returncode == 0:
             break
         assert not (tmp_path / "small.ply").exists()
     steps = len(list((tmp_path / "cells").iterdir()))
     assert steps > 8  # it did not begin anew each time
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), "0"], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_AFTER_STEPS + KILLED, str(tmp_path), "0"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "small.ply").read_bytes() == wanted
 

@@ -34,7 +34,7 @@ from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.rounds import merge
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
-from pointsplat_ns.system.processes import first_alone, rank, together, world_size
+from pointsplat_ns.system.processes import by_first, first_alone, rank, together, world_size
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
@@ -101,7 +101,7 @@ def merge_file(
                 with work.finished(cell).open("rb") as finished:
                     shutil.copyfileobj(finished, stream, 1 << 20)
 
-    together(lambda: join() if rank() == 0 else None)
+    by_first(join)
     return cells.count, k
 
 
