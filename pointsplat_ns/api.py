@@ -131,7 +131,7 @@ def prune(
         resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080".
             Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
-        up: the axis that is up in the scene, "z" or "-y", for sampled views; by default it is estimated.
+        up: the axis that is up in the scene, "z" or "-y", for sampled views; by default the scene's own, or estimated.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:

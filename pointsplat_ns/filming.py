@@ -61,7 +61,8 @@ def render_path(
             cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
         split: layout of two scenes: "side-by-side", or "wipe" with a moving line between them.
         labels: labels of two scenes; by default their names and counts. An empty list writes none.
-        up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default it is estimated.
+        up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default the scene's own, or
+            estimated.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels.
         fps: frames a second; by default 24, or as in the saved path.
@@ -127,7 +128,7 @@ def open_viewer(
         scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it. The folder
             of a stream with a page (``lod(html=True)``) alone shows that page, which the browser draws.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
-        up: the axis that is up in the scene ("z", "-y"); by default it is estimated.
+        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
         host: the address to listen on; by default only this machine has access. With another address, every machine
             that reaches it has access.
         port: the first port to try; 0 takes any free port.

@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.geometry.transforms import AXES
 
 MAX_SH_DEGREE = 3
 
@@ -36,6 +37,17 @@ def sh_degree_of(num_rest: int) -> int:
     )
 
 
+class Traits(NamedTuple):
+    """What files declare of a scene beside its Gaussians; see :class:`Gaussians`."""
+
+    antialiased: bool = False
+    up: str | None = None
+
+
+PLAIN = Traits()
+"""The traits of a scene of which nothing is declared."""
+
+
 @dataclass(frozen=True, repr=False)
 class Gaussians:
     """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own parametrisation.
@@ -49,10 +61,11 @@ class Gaussians:
         features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 + :data:`SH_C0` * features_dc.
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
         antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so is.
+        up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it; else None.
 
     Raises:
-        SceneError: if a shape, device or dtype does not fit the others, or no SH degree has this number of
-            coefficients.
+        SceneError: if a shape, device or dtype does not fit the others, no SH degree has this number of coefficients,
+            or ``up`` is no axis.
 
     Example:
         Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside it.
@@ -82,6 +95,7 @@ class Gaussians:
     features_dc: Tensor  # [N, 3] constant SH coefficient
     features_rest: Tensor  # [N, (d+1)^2 - 1, 3] the other SH coefficients
     antialiased: bool = dataclasses.field(default=False, kw_only=True)
+    up: str | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         tails = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
@@ -101,6 +115,8 @@ class Gaussians:
                 )
         if not self.means.dtype.is_floating_point:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
+        if self.up is not None and self.up not in AXES:
+            raise SceneError(f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
 
     @classmethod
     def empty(cls, sh_degree: int = 0, **kwargs: Any) -> Gaussians:
@@ -111,13 +127,14 @@ class Gaussians:
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the scenes is."""
+        """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the scenes is, with
+        the up axis of the first."""
         parts = zip(*(scene.tensors() for scene in scenes), strict=True)
-        return cls(*map(torch.cat, parts), antialiased=any(scene.antialiased for scene in scenes))
+        return cls(*map(torch.cat, parts), antialiased=any(scene.antialiased for scene in scenes), up=scenes[0].up)
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """``(name, tensor)`` of every parameter, in the order of the fields."""
-        return ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self)[:-1])
+        return ((name, getattr(self, name)) for name in PARAMETERS)
 
     def tensors(self) -> list[Tensor]:
         """The parameter tensors, in the order of the fields."""
@@ -125,7 +142,7 @@ class Gaussians:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """A scene whose every parameter is ``function(parameter)``."""
-        return Gaussians(*map(function, self.tensors()), antialiased=self.antialiased)
+        return Gaussians(*map(function, self.tensors()), **self.traits._asdict())
 
     def replace(self, **changes: Any) -> Gaussians:
         """A scene with some attributes replaced."""
@@ -151,6 +168,11 @@ class Gaussians:
     def detach(self) -> Gaussians:
         """The same parameters outside any autograd graph."""
         return self.map(torch.Tensor.detach)
+
+    @property
+    def traits(self) -> Traits:
+        """What a file declares of the scene beside its Gaussians."""
+        return Traits(self.antialiased, self.up)
 
     @property
     def device(self) -> torch.device:

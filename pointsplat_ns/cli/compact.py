@@ -104,8 +104,8 @@ def compact(
             COLMAP model; for one scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
-            estimated. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
+            file's own, or an estimate. Write --up=-y for a negative axis.
         picture: a .png file for images of some views: dense, before and after the repair, side by side; by default
             none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe

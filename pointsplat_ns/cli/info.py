@@ -32,8 +32,8 @@ def info(
             none.
         resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else
             1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
-            estimated. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
+            file's own, or an estimate. Write --up=-y for a negative axis.
         force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output: an object, or a list for several scenes.
     """

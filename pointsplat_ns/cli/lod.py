@@ -68,8 +68,8 @@ def lod(
             by default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
-            estimated. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
+            file's own, or an estimate. Write --up=-y for a negative axis.
         force: overwrite existing files.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.

@@ -81,8 +81,8 @@ def prune(
             COLMAP model. They must be of this scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
-            estimated. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
+            file's own, or an estimate. Write --up=-y for a negative axis.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.

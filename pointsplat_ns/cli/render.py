@@ -43,8 +43,8 @@ def render(
             or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds is given.
         split: layout of two scenes.
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
-        up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default it is estimated.
-            Write --up=-y for a negative axis.
+        up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default the file's own,
+            or an estimate. Write --up=-y for a negative axis.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels; by default in the proportion of the path or the photos.
         fps: frames a second; by default 24, or as in the saved path.

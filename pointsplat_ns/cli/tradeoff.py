@@ -52,8 +52,8 @@ def tradeoff(
             no photos are used then. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default it is
-            estimated. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
+            file's own, or an estimate. Write --up=-y for a negative axis.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
             there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best

@@ -24,8 +24,8 @@ def view(
         scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml); by default the page
             takes a file that is dropped on it.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default it is estimated. Write --up=-y for a
-            negative axis.
+        up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default the file's own, or an estimate. Write
+            --up=-y for a negative axis.
         host: the address to listen on; by default only this machine has access. With another address, every machine
             that reaches it has access.
         port: the first port to try; 0 takes any free port.

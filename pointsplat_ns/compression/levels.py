@@ -31,7 +31,7 @@ from pointsplat_ns.compression.pictures import size_quantiles
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
 from pointsplat_ns.looking.closeness import DenseReference, Reference
@@ -243,13 +243,13 @@ def _text(level: Keep) -> str:
     return str(level) if isinstance(level, (Megabytes, WithinPsnr)) else repr(level)
 
 
-def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, antialiased: bool = False) -> list[int]:
+def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits = PLAIN) -> list[int]:
     """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
     the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
     for text, budget in levels:
         try:
-            count = resolve_keep(n, budget, sh_degree, antialiased)
+            count = resolve_keep(n, budget, sh_degree, traits)
         except BudgetError as error:
             raise BudgetError(f"level {text}: {error}") from error
         if count in texts:
@@ -289,7 +289,7 @@ def make_levels(
     views = views or ViewSource(dense)
     progress("rendering the dense scene", 0.0)
     cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
-    counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.antialiased)
+    counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.traits)
     notes, reference, distance = cut.notes, None, None
     afar: dict[int, Reference] = {}
     try:

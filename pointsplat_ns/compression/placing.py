@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import smallest_turn
+from pointsplat_ns.geometry.transforms import axis_along, smallest_turn
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
@@ -29,7 +29,8 @@ def place(
     Args:
         scene: N Gaussians.
         up: new up direction, one of "x", "y", "z", "-x", "-y" and "-z"; the scene turns about the origin. The old up
-            direction is estimated, unless it is named: "-y:z" turns -y to z.
+            direction is the one that the scene declares, or estimated, unless it is named: "-y:z" turns -y to z. The
+            result declares the new one.
         scale: factor on positions and sizes, above 0.
         original_frame: the Splatfacto run of the scene (its folder, ``config.yml`` or checkpoint).
 
@@ -56,7 +57,8 @@ def place(
     if directions is not None:
         now, wanted = directions
         matrix = smallest_turn(Sampler(scene).up.direction if now is None else now, wanted)
-        scene = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
+        turned = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
+        scene = turned.replace(up=axis_along(wanted))
     if scale != 1.0:
         scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
     return scene

@@ -71,7 +71,7 @@ def prune_scene(
     notes: list[str] = []
     rendered: list[Views] = []  # the views of each scene that was merged
     full = _with_sh(dense, request.sh, views, progress, notes)
-    count = request.count_of(len(full), full.sh_degree, full.antialiased)
+    count = request.count_of(len(full), full.sh_degree, full.traits)
     start, cleaning, limit = full, None, None
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene

@@ -114,7 +114,7 @@ def prune_file(
         memory: bytes that may be taken; more than the largest cell takes change nothing.
         poses: a file of cameras; by default views are sampled.
         resolution: width and height of views, pixels.
-        up: which way is up, for sampled views; by default it is estimated.
+        up: which way is up, for sampled views; by default what the scene declares, or estimated.
         progress: called with what is being done, and the share done of it.
 
     Returns:
@@ -152,7 +152,7 @@ def prune_file(
         return known.spread(VIEW_COUNTS.weighed)
 
     def count_of(n: int) -> int:
-        count = request.count_of(n, rows.sh_degree, rows.antialiased)
+        count = request.count_of(n, rows.sh_degree, rows.traits)
         assert count is not None
         return count
 

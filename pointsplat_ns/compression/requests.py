@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.pruning import (
     Keep,
     Megabytes,
@@ -144,12 +144,12 @@ class PruneRequest:
         """The method called ``by``."""
         return method_named(self.by)
 
-    def count_of(self, n: int, sh_degree: int, antialiased: bool = False) -> int | None:
-        """Number of Gaussians to keep of ``n``, which depends on the SH degree of the result where it has to fit a
-        file; None if it needs a search (a PSNR, or the size of a compressed file). Raises BudgetError if the budget
-        does not fit the scene."""
+    def count_of(self, n: int, sh_degree: int, traits: Traits = PLAIN) -> int | None:
+        """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the result where it has
+        to fit a file; None if it needs a search (a PSNR, or the size of a compressed file). Raises BudgetError if the
+        budget does not fit the scene."""
         if not found_by_trying(self.budget):
-            return resolve_keep(n, self.budget, sh_degree, antialiased)
+            return resolve_keep(n, self.budget, sh_degree, traits)
         if isinstance(self.budget, Megabytes):
             check_size(self.budget, n)
         return None

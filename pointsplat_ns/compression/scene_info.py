@@ -93,7 +93,7 @@ def info(
         scene: N Gaussians, or the path of a scene. Undrawable Gaussians of a file are counted too; other functions drop
             them when reading.
         resolution: size of the pictures in which fill is counted, pixels; by default 1920x1080.
-        up: the axis that is up, such as "-y"; by default it is estimated.
+        up: the axis that is up, such as "-y"; by default the scene's own, or estimated.
 
     Raises:
         SceneError: if the file is not usable.
@@ -181,7 +181,7 @@ def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
     """Bytes of a file by share of the Gaussians; empty for formats that are not written to one file."""
     counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in (1.0, 0.5, 0.3, 0.1, 0.03)}
     if kind.bytes_of is not None:
-        return {text: kind.bytes_of(count, scene.sh_degree, scene.antialiased) for text, count in counts.items()}
+        return {text: kind.bytes_of(count, scene.sh_degree, scene.traits) for text, count in counts.items()}
     if kind.suffix not in (".spz", ".sog") or not len(scene):
         return {}
     try:

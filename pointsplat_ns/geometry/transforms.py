@@ -11,6 +11,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+AXES = ("x", "y", "z", "-x", "-y", "-z")
+"""Names of the directions along the axes of the world."""
+
+
+def direction_of(axis: str) -> Tensor:
+    """The direction (3,), float64, that one of :data:`AXES` names."""
+    direction = torch.zeros(3, dtype=torch.float64)
+    direction["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
+    return direction
+
+
+def axis_along(direction: Tensor) -> str | None:
+    """The name of the axis along a direction (3,) of length 1, up to rounding; None if it lies along none."""
+    axis = int(direction.abs().argmax())
+    if float(direction.abs()[axis]) <= 1 - 1e-6:
+        return None
+    return ("-" if float(direction[axis]) < 0 else "") + "xyz"[axis]
+
 
 def flip_camera_axes(camera_to_worlds: Tensor) -> Tensor:
     """Camera-to-world matrices (..., 3 or 4, 4) with OpenGL axes from OpenCV ones, or the other way round: the second

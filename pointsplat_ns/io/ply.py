@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, sh_degree_of
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
-from pointsplat_ns.io.ply_header import ANTIALIASED, Element, Header, is_antialiased, read_header
+from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.system.pieces import CHUNK
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
@@ -61,7 +61,7 @@ def read_ply(path: Path | str) -> Gaussians:
         else:
             with _GaussiansAlone(path, header) as stream:
                 rows = PlyData.read(stream)["vertex"].data
-            scene = _scene(len(rows), lambda these: rows[these], k, in_file, is_antialiased(header, path))
+            scene = _scene(len(rows), lambda these: rows[these], k, in_file, traits_of(header, path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -79,8 +79,8 @@ class PlyRows:
     """Number of Gaussians in the file, those that cannot be drawn included."""
     rest: int
     """Number of SH coefficients per channel beyond the constant one that are read."""
-    antialiased: bool
-    """Whether the scene was trained with antialiasing."""
+    traits: Traits
+    """What the file declares beside the Gaussians."""
     _dtype: np.dtype
     """Properties of a row."""
     _start: int
@@ -105,7 +105,7 @@ class PlyRows:
         """The rows of a file with what :func:`_checked` found in it."""
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        return cls(path, vertex.count, min(in_file, MAX_REST), is_antialiased(header, path), dtype, start, in_file)
+        return cls(path, vertex.count, min(in_file, MAX_REST), traits_of(header, path), dtype, start, in_file)
 
     def __len__(self) -> int:
         return self.count
@@ -152,7 +152,7 @@ class PlyRows:
                 raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
             return np.frombuffer(data, self._dtype)
 
-        return _scene(count, rows_of, self.rest, self._in_file, self.antialiased)
+        return _scene(count, rows_of, self.rest, self._in_file, self.traits)
 
 
 def _checked(path: Path) -> tuple[Header, Element, int]:
@@ -177,7 +177,7 @@ def write_ply(scene: Gaussians, path: Path | str) -> None:
         SceneError: if ``path`` cannot be written.
     """
     scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
-    about = len(scene), scene.sh_degree, scene.antialiased
+    about = len(scene), scene.sh_degree, scene.traits
     with replacing(path, ply_bytes(*about)) as part, part.open("wb") as stream:
         stream.write(header_bytes(*about))
         for first in range(0, len(scene), CHUNK):
@@ -192,18 +192,17 @@ def row_table(scene: Gaussians) -> np.ndarray:
     return np.ascontiguousarray(torch.cat(values, dim=1).numpy().astype("<f4", copy=False))
 
 
-def header_bytes(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
+def header_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> bytes:
     """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
     names = _column_names(3 * ((sh_degree + 1) ** 2 - 1))
-    lines = ["ply", "format binary_little_endian 1.0", *[f"comment {ANTIALIASED}"] * antialiased]
-    lines.append(f"element vertex {count}")
+    lines = [*first_lines(traits), f"element vertex {count}"]
     return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
 
 
-def ply_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
+def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
     """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
     included) and three for each SH coefficient beyond the constant one, as float32."""
-    return len(header_bytes(count, sh_degree, antialiased)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
+    return len(header_bytes(count, sh_degree, traits)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
 
 
 def _column_names(rest: int) -> list[str]:
@@ -301,7 +300,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
     return len(rest) // 3
 
 
-def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: int, antialiased: bool) -> Gaussians:
+def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: int, traits: Traits) -> Gaussians:
     """The scene in ``count`` structured rows, of which ``rows_of`` gives those of a slice, with ``k`` coefficients per
     channel beyond the constant one, of ``in_file`` that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
@@ -327,4 +326,4 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
         tables["scales"] = np.column_stack([tables["scales"], np.full(count, -np.inf, np.float32)])
     tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
     tensors["features_rest"] = tensors["features_rest"].reshape(count, k, 3)
-    return Gaussians(**tensors, antialiased=antialiased)
+    return Gaussians(**tensors, antialiased=traits.antialiased, up=traits.up)

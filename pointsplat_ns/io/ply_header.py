@@ -15,6 +15,8 @@ from typing import BinaryIO
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Traits
+from pointsplat_ns.geometry.transforms import AXES
 from pointsplat_ns.io.files import logger
 
 MAX_HEADER_BYTES = 1 << 20
@@ -31,6 +33,8 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 ANTIALIASED = "SplatRenderMode: mip"
 """The comment of a scene that was trained with antialiasing, as Brush and splat-transform write it."""
+UP = "Vertical Axis: "
+"""The start of the comment that names the up axis, as nerfstudio writes it."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +121,20 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size, comments)
 
 
-def is_antialiased(header: Header, path: Path) -> bool:
-    """Whether the last comment on rendering says that a scene was trained with antialiasing. Other ways of rendering
-    are warned of.
+def first_lines(traits: Traits) -> list[str]:
+    """The lines of a header before its elements."""
+    comments = [ANTIALIASED] * traits.antialiased + ([] if traits.up is None else [UP + traits.up])
+    return ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
 
-    Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``.
+
+def traits_of(header: Header, path: Path) -> Traits:
+    """The traits of a scene that a header's comments tell; the last comment on each counts. Ways of rendering other
+    than ordinary and antialiased are warned of.
+
+    Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``, nerfstudio
+    ``Vertical Axis: z``.
     """
-    found = False
+    found, up = False, None
     for comment in header.comments:
         words = comment.lower().replace(":", " ").split()
         if words[:1] == ["splatrendermode"] and len(words) > 1:
@@ -132,7 +143,9 @@ def is_antialiased(header: Header, path: Path) -> bool:
                 logger.warning("%s: trained for %r rendering; drawn here as ordinary Gaussians", path, words[1])
         elif words[:1] == ["antialiased"] and words[1:] in (["0"], ["1"]):
             found = words[1] == "1"
-    return found
+        elif words[:2] == ["vertical", "axis"] and len(words) == 3 and words[2].removeprefix("+") in AXES:
+            up = words[2].removeprefix("+")
+    return Traits(found, up)
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:

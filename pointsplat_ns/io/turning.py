@@ -10,11 +10,12 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import sh_matrix
-from pointsplat_ns.geometry.transforms import quaternions_of, zero_as_identity
+from pointsplat_ns.geometry.transforms import axis_along, direction_of, quaternions_of, zero_as_identity
 
 
 def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
-    """A scene whose positions, rotations and SH are turned about the origin.
+    """A scene whose positions, rotations, SH and declared up axis are turned about the origin. An up direction that is
+    no axis any more is not declared.
 
     Args:
         scene: N Gaussians.
@@ -38,6 +39,7 @@ def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaus
         means=scene.means @ matrix.T.to(like),
         quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
         features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
+        up=None if scene.up is None else axis_along(matrix @ direction_of(scene.up)),
     )
 
 

@@ -56,7 +56,7 @@ def opening_views(
         count: number of views, at least 1; fewer are returned where there are no more.
         width: of the pictures, pixels, if the views are not known ones.
         height: of the pictures, pixels.
-        up: which way is up; by default it is estimated.
+        up: which way is up; by default what the scene declares, or estimated.
         known: views that people took or chose. Their size, background and rasterize mode apply to all views.
         settings: tuned numbers.
 

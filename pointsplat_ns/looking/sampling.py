@@ -20,7 +20,7 @@ from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
-from pointsplat_ns.looking.upright import Up, UprightBox, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import Up, UprightBox, known_up, pointing_up, upright_axis
 from pointsplat_ns.looking.whole import seen_from_above
 from pointsplat_ns.views import Views
 
@@ -52,7 +52,7 @@ def sample_views(
         width: of the images, pixels.
         height: of the images, pixels. The field of view is 70 degrees across the longer side.
         seed: the same scene and seed give the same views, another seed gives others.
-        up: (3,) direction that is up in the world, of any length; by default it is estimated from the scene
+        up: (3,) direction that is up in the world, of any length; by default the scene's own, or estimated
             (:mod:`pointsplat_ns.looking.upright`).
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
 
@@ -81,7 +81,7 @@ class Sampler:
     Args:
         scene: N Gaussians. A large one is thinned.
         resolution: width and height of the views, pixels.
-        up: which way is up; by default it is estimated.
+        up: which way is up; by default the axis that the scene declares, or estimated.
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
 
     Raises:
@@ -98,7 +98,7 @@ class Sampler:
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
         self.scene, self._count = thinned(scene.detach(), settings.sampled_count), len(scene)
-        self.resolution, self.settings, self._up = resolution, settings, up
+        self.resolution, self.settings, self._up = resolution, settings, known_up(up, scene)
 
     @cached_property
     def photos(self) -> PhotoPlaces | None:

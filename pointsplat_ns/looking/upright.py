@@ -9,13 +9,14 @@ about, and hold cameras at about one height.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
@@ -28,7 +29,7 @@ class Up:
     direction: Tensor
     """(3,) float64, of length 1."""
     sure: bool = True
-    """Whether it was named, or clearly more of the scene is seen from above than from below."""
+    """Whether it was named or declared, or clearly more of the scene is seen from above than from below."""
 
     def __str__(self) -> str:
         """The name of the axis, or the direction.
@@ -37,11 +38,7 @@ class Up:
             >>> str(Up(torch.tensor([0.0, -1.0, 0.0]), sure=False))
             '-y (a guess)'
         """
-        axis = int(self.direction.abs().argmax())
-        if float(self.direction.abs()[axis]) > 1 - 1e-6:
-            text = ("-" if float(self.direction[axis]) < 0 else "") + "xyz"[axis]
-        else:
-            text = " ".join(f"{value:.2f}" for value in self.direction.tolist())
+        text = axis_along(self.direction) or " ".join(f"{value:.2f}" for value in self.direction.tolist())
         return text if self.sure else f"{text} (a guess)"
 
 
@@ -51,12 +48,10 @@ def axis_named(text: str) -> Tensor:
     Raises:
         PointSplatError: if there is no such axis.
     """
-    name = text.strip().lower()
-    if not re.fullmatch(r"[+-]?[xyz]", name):
-        raise PointSplatError(f"up is {text!r}; expected x, y, z, -x, -y or -z")
-    axis = torch.zeros(3, dtype=torch.float64)
-    axis["xyz".index(name[-1])] = -1.0 if name[0] == "-" else 1.0
-    return axis
+    name = text.strip().lower().removeprefix("+")
+    if name not in AXES:
+        raise PointSplatError(f"up is {text!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
+    return direction_of(name)
 
 
 def up_named(text: str | None) -> Up | None:
@@ -66,6 +61,11 @@ def up_named(text: str | None) -> Up | None:
         PointSplatError: if there is no such axis.
     """
     return None if text is None else Up(axis_named(text))
+
+
+def known_up(named: Up | None, scene: Gaussians) -> Up | None:
+    """The up direction that needs no estimate: the named one, else the one that the scene's file declares."""
+    return named or up_named(scene.up)
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ class ViewSource:
         resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
             have their own, and sampled views 1920 x 1080.
         settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
-        up: which way is up, for sampled views; by default it is estimated.
+        up: which way is up, for sampled views; by default what the scene declares, or estimated.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
@@ -46,10 +46,12 @@ class FlightFrame:
     @staticmethod
     def of(scene: Gaussians, views: Views | None = None, up: Up | None = None) -> FlightFrame:
         """The frame of a scene, which also suits smaller versions of it. A flight starts at the known view that shows
-        most, see :func:`~pointsplat_ns.looking.opening.opening_views`; by default up is that of the views, or
-        estimated. Raises SceneError if no Gaussian can be drawn, and DataError if none is visible."""
+        most, see :func:`~pointsplat_ns.looking.opening.opening_views`; by default up is what the
+        scene declares, that of the views, or estimated. Raises SceneError if no Gaussian can be drawn, and DataError if
+        none is visible."""
         need_usable(scene)
         known = None if views is None or len(views) == 0 else views.spread(VIEW_COUNTS.opening)
+        up = known_up(up, scene)
         if up is None and known is not None:
             up = _up_of(known, Sampler(scene).up)
         opening = opening_views(scene.detach(), 6, up=up, known=known)

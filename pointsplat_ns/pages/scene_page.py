@@ -45,7 +45,7 @@ def write_page(
         views: known views for the page's buttons; by default found from the first scene. The page opens at the one
             that shows most, or at one that shows the whole subject. Background and rasterize mode of the views apply
             to all scenes.
-        up: the axis that is up in the scene ("z", "-y"); by default that of the views, or estimated.
+        up: the axis that is up in the scene ("z", "-y"); by default the scene's own, that of the views, or estimated.
         limit_mb: maximum size of the file, in units of 10^6 bytes.
         progress: True shows a bar; a function is called with the name of the task and its share done.
 

@@ -44,7 +44,7 @@ def stream_page(viewer: WebViewer, scene: Gaussians, known: Views | None, up: Up
         viewer: its files.
         scene: N Gaussians, not turned.
         known: views that people took, if there are any; see :meth:`~pointsplat_ns.pages.flight.FlightFrame.of`.
-        up: which way is up; by default that of the views, or estimated.
+        up: which way is up; by default the scene's own, that of the views, or estimated.
         title: of the page.
 
     Raises:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.gaussians import PLAIN, Traits
 from pointsplat_ns.io.formats.registry import WRITABLE, format_named, format_to_write
 from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
@@ -33,8 +34,8 @@ class Megabytes:
             raise BudgetError(f"keep is the size of a {self.suffix} file; expected one of {WRITABLE}")
 
     @property
-    def bytes_of(self) -> Callable[[int, int, bool], int] | None:
-        """Size of a file, bytes, by count and SH degree; None if it is known only after writing."""
+    def bytes_of(self) -> Callable[[int, int, Traits], int] | None:
+        """Size of a file, bytes, by count, SH degree and traits; None if it is known only after writing."""
         return format_to_write(self.suffix).bytes_of
 
     def __str__(self) -> str:
@@ -60,7 +61,7 @@ class BareCount(int):
 Keep = float | int | Megabytes | WithinPsnr
 
 
-def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, antialiased: bool = False) -> int:
+def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = PLAIN) -> int:
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
@@ -72,6 +73,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, antialiased: bool
         keep: float ratio in (0, 1], int count in 1..n, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
             it.
         sh_degree: SH degree of the scene that will be written; only a size depends on it.
+        traits: of the scene; only a size depends on them.
 
     Returns:
         The count, in 1..n.
@@ -91,7 +93,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, antialiased: bool
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
     if isinstance(keep, Megabytes):
-        return _count_that_fits(n, keep, sh_degree, antialiased)
+        return _count_that_fits(n, keep, sh_degree, traits)
     if isinstance(keep, bool) or not isinstance(keep, Real):
         raise BudgetError(f"keep is {keep!r}; {KEEP_FORMS}")
     if n < 1:
@@ -128,7 +130,7 @@ def check_size(keep: Megabytes, n: int) -> int:
     return math.floor(keep.value * 1e6)
 
 
-def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, antialiased: bool) -> int:
+def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, traits: Traits) -> int:
     """Largest number of Gaussians, at most ``n``, whose file is no larger than the budget."""
     bytes_of, limit = keep.bytes_of, check_size(keep, n)
     if bytes_of is None:
@@ -136,9 +138,9 @@ def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, antialiased: bool)
             f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
         )
     # The size never falls with the count, but grows unevenly: headers hold its digits, and chunks are padded.
-    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree, antialiased))
+    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree, traits))
     if count < 1:
-        least = bytes_of(1, sh_degree, antialiased)
+        least = bytes_of(1, sh_degree, traits)
         raise BudgetError(
             f"keep is {keep}, too small for one Gaussian of SH degree {sh_degree}; expected at least {least / 1e6:g}MB"
         )

@@ -141,7 +141,7 @@ def prune(
     """
     method = method_named(by)
     check_opacity_weight(method, opacity_weight)
-    count = resolve_keep(len(scene), keep, scene.sh_degree, scene.antialiased)
+    count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
     need_usable(scene)
     if method.score is None:
         merged = merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None)

@@ -47,7 +47,7 @@ def find_scene(
     kind = format_to_write(subject.suffix)
     size, bytes_of = _estimated(subject), kind.bytes_of
     if bytes_of is not None:
-        size = lambda count, degree: bytes_of(count, degree, dense.antialiased)  # noqa: E731
+        size = lambda count, degree: bytes_of(count, degree, dense.traits)  # noqa: E731
     plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
     search = TargetSearch(
         targets, plan, measure, measurer.cut_psnr, measurer.judged_views.where, size, exact=kind.suffix == ".ply"

@@ -22,7 +22,7 @@ from pointsplat_ns.io.camera_files.cameras import finite
 from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
-from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.viewing.trajectories import along, fitted, orbit, walk
 from pointsplat_ns.views import Views
@@ -103,12 +103,14 @@ def camera_path(
             that nerfstudio's viewer saved.
         settings: size, speed and length.
         one: return one camera only: the one that shows most, unless the path says which.
-        up: which way is up, for a walk or an orbit; by default that of known views, or estimated.
+        up: which way is up, for a walk or an orbit; by default what the scene declares, that of known views, or
+            estimated.
 
     Raises:
         DataError: if there are no views, or the file is not a camera path.
         SceneError: if there is no such file.
     """
+    up = known_up(up, scene)
     if str(path) not in ("auto", "dataset", "walk", "orbit"):
         saved = read_path(path)
         fps = settings.fps or saved.fps or CAMERA_PATH.fps

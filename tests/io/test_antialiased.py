@@ -48,7 +48,7 @@ def test_only_the_comment_tells_two_ply_files_apart(tmp_path):
     assert b == a.replace(b" 1.0\n", b" 1.0\ncomment SplatRenderMode: mip\n", 1)
     assert same_bits(ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply"))
     rows = PlyRows.open(tmp_path / "b.ply")
-    assert rows is not None and rows.antialiased and rows.read(3, 5).antialiased
+    assert rows is not None and rows.traits.antialiased and rows.read(3, 5).antialiased
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
@@ -87,11 +87,11 @@ def test_the_size_of_a_file_is_known_to_the_byte_and_a_budget_holds(tmp_path, su
     scene, path = trained_so(cloud(600)), tmp_path / f"a{suffix}"
     size = format_to_write(path).bytes_of
     ps.save(scene[:400], path)
-    assert path.stat().st_size == size(400, 1, True)
-    assert size(400, 1, True) - size(400, 1, False) == (29 if "ply" in suffix else 0)
-    kept = ps.prune(scene, Megabytes(size(400, 1, True) / 1e6, suffix), by="coverage")
+    assert path.stat().st_size == size(400, 1, scene.traits)
+    assert size(400, 1, scene.traits) - size(400, 1, cloud(1).traits) == (29 if "ply" in suffix else 0)
+    kept = ps.prune(scene, Megabytes(size(400, 1, scene.traits) / 1e6, suffix), by="coverage")
     assert len(kept) == 400 and kept.antialiased
-    just_too_small = Megabytes((size(400, 1, True) - 1) / 1e6, suffix)
+    just_too_small = Megabytes((size(400, 1, scene.traits) - 1) / 1e6, suffix)
     assert len(ps.prune(scene, just_too_small, by="coverage")) < 400
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians, sh_degree_of
+from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     Array,
@@ -28,7 +28,7 @@ from pointsplat_ns.io.formats.coding import (
     smallest_three,
     unit_quats,
 )
-from pointsplat_ns.io.ply_header import ANTIALIASED, Element, Header, is_antialiased, read_header
+from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.system.progress import Progress, silent
 
 CHUNK_GAUSSIANS = 256
@@ -66,15 +66,15 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
         blocks = Blocks(load_bytes(path), path, header.size)
         data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
         scene = _decode(data["chunk"], data["vertex"], data.get("sh"), rest)
-        scene = scene.replace(antialiased=is_antialiased(header, path))
+        scene = scene.replace(**traits_of(header, path)._asdict())
     return keep_usable(scene, path)
 
 
-def compressed_ply_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
+def compressed_ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
     """Size of a compressed PLY of ``count`` Gaussians, bytes."""
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
     chunks = -(-count // CHUNK_GAUSSIANS)
-    return len(_header_text(count, rest, antialiased)) + 4 * len(_BOUNDS) * chunks + (16 + rest) * count
+    return len(_header_text(count, rest, traits)) + 4 * len(_BOUNDS) * chunks + (16 + rest) * count
 
 
 def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> bytes:
@@ -99,13 +99,12 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
     rest = scene.features_rest.transpose(1, 2).flatten(1).double().numpy()
     sh = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)  # of [-4, 4]
     packed = np.stack(words, axis=1).astype("<u4")
-    header = _header_text(n, rest.shape[1], scene.antialiased)
+    header = _header_text(n, rest.shape[1], scene.traits)
     return b"".join((header, chunks.tobytes(), packed.tobytes(), sh.tobytes()))
 
 
-def _header_text(count: int, rest: int, antialiased: bool) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *[f"comment {ANTIALIASED}"] * antialiased]
-    lines.append(f"element chunk {-(-count // CHUNK_GAUSSIANS)}")
+def _header_text(count: int, rest: int, traits: Traits) -> bytes:
+    lines = [*first_lines(traits), f"element chunk {-(-count // CHUNK_GAUSSIANS)}"]
     lines += [f"property float {name}" for name in _BOUNDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if rest:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
@@ -201,7 +201,7 @@ def _entry(entries: Any, index: Any) -> dict[str, Any]:
     return entries[index]
 
 
-def glb_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
+def glb_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
     """Size of a ``.glb`` of ``count`` Gaussians, bytes."""
     floats = 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
     return 12 + 8 + JSON_BYTES + 8 + (4 * floats + 4) * count

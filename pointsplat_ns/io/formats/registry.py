@@ -10,7 +10,7 @@ from pathlib import Path
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
@@ -45,9 +45,9 @@ class Format:
     write: Writer | None = None
     starts: tuple[bytes, ...] = ()
     """What its files begin with, if that tells."""
-    bytes_of: Callable[[int, int, bool], int] | None = None
-    """Exact size of a file, bytes, by the number of Gaussians, their SH degree, and whether the scene is antialiased;
-    None if it depends on more."""
+    bytes_of: Callable[[int, int, Traits], int] | None = None
+    """Exact size of a file, bytes, by the number of Gaussians, their SH degree, and the scene's traits; None
+    if it depends on more."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
     rounded: Callable[[Gaussians, Rounding], Gaussians] | None = None

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     bytes_of_logits,
@@ -54,7 +54,7 @@ def read_splat(path: Path | str) -> Gaussians:
     return keep_usable(scene, path)
 
 
-def splat_bytes(count: int, sh_degree: int, antialiased: bool = False) -> int:
+def splat_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
     """Size of a ``.splat`` file of ``count`` Gaussians, bytes."""
     return _ROW.itemsize * count
 

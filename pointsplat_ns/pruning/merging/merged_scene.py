@@ -36,7 +36,7 @@ def scene_maker(participants: Participants, groups: Groups, settings: MergeSetti
 
     def make(size_change: float) -> Gaussians:
         scales = torch.where(single, own_scales, (log_scales + size_change).to(scene.dtype))
-        return Gaussians(means, scales, quats, opacities, *sh, antialiased=scene.antialiased)
+        return Gaussians(means, scales, quats, opacities, *sh, **scene.traits._asdict())
 
     return make
 

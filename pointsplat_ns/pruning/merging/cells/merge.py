@@ -95,8 +95,8 @@ def merge_file(
     together(lambda: work.finish(rounds))
 
     def join() -> None:
-        with replacing(output, ply_bytes(k, rows.sh_degree, rows.antialiased)) as part, part.open("wb") as stream:
-            stream.write(header_bytes(k, rows.sh_degree, rows.antialiased))
+        with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
+            stream.write(header_bytes(k, rows.sh_degree, rows.traits))
             for cell in range(len(cells)):
                 with work.finished(cell).open("rb") as finished:
                     shutil.copyfileobj(finished, stream, 1 << 20)
