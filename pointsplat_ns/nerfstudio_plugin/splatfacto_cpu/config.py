@@ -53,21 +53,25 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
     The interval of the opacity reset is a multiple of it.
 
-    Few steps can train only few Gaussians, and have to take them far. So the gradient above which a Gaussian is split
-    or duplicated grows with the root of how many times shorter the run is, but at most eightfold, as in a run of 470
-    steps. The learning rates of Gaussians begin as many times higher, and end as Splatfacto's.
+    Few steps can train only few Gaussians, and have to take them far. So the learning rates of Gaussians begin higher,
+    by the root of how many times shorter the run is, but at most eight times, as in a run of 470 steps, and end as
+    Splatfacto's. The gradient above which a Gaussian is split or duplicated grows by the root of that.
+
+    Gaussians are not split by their size on screen. The small pictures at the beginning make all of them look large:
+    a third of a scene came of that, and half of it was culled again.
     """
     length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
     config = copy.deepcopy(config)
     defaults = SplatfactoCpuModelConfig()
     model = config.pipeline.model
-    steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_screen_size_at"]
-    steps += ["stop_relocation_at"]
+    steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_relocation_at"]
     fitted: dict[str, float] = {name: max(1, round(share * getattr(defaults, name))) for name in steps}
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
     haste = min(8.0, 1 / math.sqrt(share))
-    fitted["densify_grad_thresh"] = haste * defaults.densify_grad_thresh
+    fitted["densify_grad_thresh"] = math.sqrt(haste) * defaults.densify_grad_thresh
+    if share < 1:
+        fitted["stop_screen_size_at"] = 0
     for name, value in fitted.items():
         if getattr(model, name) == getattr(defaults, name):
             setattr(model, name, value)

@@ -184,3 +184,18 @@ def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
     config.pipeline.model.max_gs_num = 0
     with pytest.raises(PointSplatError, match="max-gs-num 0: expected at least 1"):
         _ = config.pipeline.model.cap
+
+
+def test_a_short_training_densifies_by_gradient_alone_and_a_whole_one_as_splatfacto():
+    """Rates begin (30,000 / steps) ** 0.5 times higher, and the gradient of densification rises by the root of that."""
+    config = splatfacto_cpu_config()
+    config.max_num_iterations = 1875
+    short = fitted_schedules(config).pipeline.model
+    assert short.densification(10).refine_scale2d_stop_iter == 0
+    assert short.densify_grad_thresh == pytest.approx(2 * SplatfactoCpuModelConfig().densify_grad_thresh)
+    assert fitted_schedules(config).optimizers["means"]["scheduler"].first == pytest.approx(4)
+    config.pipeline.model.stop_screen_size_at = 7
+    assert fitted_schedules(config).pipeline.model.stop_screen_size_at == 7
+    whole = splatfacto_cpu_config()
+    whole.max_num_iterations = 30_000
+    assert fitted_schedules(whole).pipeline.model == SplatfactoCpuModelConfig()
