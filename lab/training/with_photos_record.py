@@ -25,7 +25,7 @@ of the training with a cap are chosen on them.
 - PSNR, SSIM and LPIPS are means over all held-out photos, at the size of the photos that the dense scene is trained on.
 - CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
   dense training, which all ways need but the training with a cap.
-- `{COMPACTED}` merges, repairs and trains on the training photos for 400 steps. "{COMPACTED_LONG}" trains on
+- `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" trains on
   them for as many seconds (`--seconds`) as the dense training took.
 - "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
   them on the photos as `{COMPACTED}` does, for as many CPU seconds as `{COMPACTED}` takes in all; reading and

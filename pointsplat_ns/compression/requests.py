@@ -36,7 +36,7 @@ STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
 """Number of repair steps of each effort."""
 
 
-PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 400, "thorough": 4000}
+PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 1200, "thorough": 12000}
 """Number of steps on photos of each effort."""
 
 

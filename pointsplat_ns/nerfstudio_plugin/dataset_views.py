@@ -96,7 +96,7 @@ class TrainingPhotos(Sequence[Example]):
 
         camera, data = self._frames[index]
         view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
-        return Example(view, _colours(data), data.get("mask"))
+        return Example(view, data["image"][..., :3], data.get("mask"))
 
 
 def _colours(data: dict[str, Any]) -> Tensor:
