@@ -157,8 +157,12 @@ class BudgetSettings:
     few."""
     first_bytes: float = 15.0
     """Bytes of a Gaussian at the first try for a size."""
-    room: float = 0.8
-    """Share of a limit below which a file's numbers are rounded less."""
+    room: float = 0.05
+    """Share of a limit that a file may leave before its numbers are rounded less."""
+    bytes_of_step: float = 0.12
+    """Usual growth of a file where numbers are rounded a step finer, as a logarithm."""
+    roundings: int = 6
+    """Roundings that are tried for a limit, at most."""
     unknown_psnr: float = 30.0
     """PSNR, in dB, that scenes are taken to have where there are no views to measure it in, for rounding."""
     repaired: SearchSettings = SearchSettings(precision=1.1)
@@ -201,7 +205,7 @@ class FileLimit:
 
     def rounded(self, scene: Gaussians) -> Gaussians:
         """A scene rounded so that its file meets the limit, on its device: coarser if the file is too large, finer if
-        there is much room. If it is too large at six steps coarser, that is returned."""
+        there is room. If no rounding that is tried meets it, the last is returned."""
         if self.kind.rounded is None:
             return scene
         written, rounding = _as_written(scene), self.rounding
@@ -209,19 +213,18 @@ class FileLimit:
             if self.most == math.inf or self.bytes_of(written) <= self.most:
                 return scene
             rounding = rounding_for(math.inf)
-        best = self.kind.rounded(written, rounding)
+        best, largest, steps = self.kind.rounded(written, rounding), 0, 0.0
         if self.most == math.inf:
             return best.to(scene.device)
-        size = self.bytes_of(best)
-        finer = size <= BUDGETS.room * self.most
-        for step in range(1, 7):
-            if not finer and size <= self.most:
+        for _ in range(BUDGETS.roundings):
+            tried = self.kind.rounded(written, rounding.finer(steps)) if steps else best
+            size = self.bytes_of(tried)
+            if largest < size <= self.most or not largest:
+                best, largest = tried, size if size <= self.most else 0
+            room = math.log(self.most / size)
+            if 0 <= room <= BUDGETS.room:
                 break
-            other = self.kind.rounded(written, rounding.finer(step if finer else -step))
-            size = self.bytes_of(other)
-            if finer and size > self.most:
-                break
-            best = other
+            steps += (room - 0.5 * BUDGETS.room) / BUDGETS.bytes_of_step
         return best.to(scene.device)
 
 

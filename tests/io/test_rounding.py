@@ -9,10 +9,11 @@ import pointsplat_ns as ps
 from making import cloud, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook, palette
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of, weights
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.pruning.merging.covariance import covariances, unpack
 from pointsplat_ns.rasterizer import render
@@ -166,3 +167,23 @@ def test_many_rows_are_stood_for_by_near_ones():
     assert len(book) == 4096 and shares[-1] == 1.0
     # Each centre holds about 17 rows and has about 14 entries: nearly every row one of its own.
     assert float((book[index] - rows).square().mean()) < 0.5 * 0.01**2
+
+
+def test_rows_of_few_different_numbers_are_their_own_palette():
+    rows = torch.cartesian_prod(*[torch.arange(-2.0, 3.0)] * 3)
+    book, index = palette(rows.repeat(20, 1), SILENT, 128)
+    assert len(book) == 128 and torch.equal(book[index], rows.repeat(20, 1))
+
+
+def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
+    scene = cloud(4000, sh_degree=1).replace(features_rest=rows_of(4000, 9).reshape(4000, 3, 3))
+    errors, numbers = [], []
+    for tolerance in (0.1, 0.01, 1e-4):
+        rest = format_to_write(".sog").rounded(scene, Rounding(tolerance)).features_rest.flatten(1)
+        numbers.append(len(rest.unique(dim=0)))
+        each = weights(scene)
+        errors.append(
+            float((each @ (rest - rows_of(4000, 9)).double().square().sum(1) / each.sum() / 3).sqrt()) * SH_C0
+        )
+        assert errors[-1] < 1.1 * ROUNDING.palette_error * tolerance or numbers[-1] > 1000
+    assert 64 <= numbers[0] < numbers[1] < numbers[2] <= 2000 and errors[0] > errors[1] > errors[2]

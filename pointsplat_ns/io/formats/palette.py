@@ -13,6 +13,9 @@ LEVELS = 256
 _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
+_AT_ONCE = 1 << 22
+"""Rows times entries up to which a cluster gets all its entries at once: for fewer, splits take longer and err more."""
+
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means in one dimension):
@@ -93,7 +96,8 @@ def palette(
     while waiting:
         members, k, depth = waiting.pop()
         part, weight = rows[members], weights[members]
-        if k > branches and depth < deepest:
+        at_once = k <= branches or k * len(part) <= _AT_ONCE
+        if not at_once and depth < deepest:
             sample = torch.randperm(len(part), generator=generator)[:_SAMPLE]
             centres = _means(part[sample], weight[sample], branches, generator)
             of = _assign(part, centres)
@@ -104,7 +108,7 @@ def palette(
             waiting += [(group, own, depth + 1) for group, own in zip(groups, share, strict=True) if own]
             continue
         # Rows that clusters do not tell apart, as where nearly all are equal, are cut into pieces of one size.
-        if k <= branches:
+        if at_once:
             centres = _means(part, weight, k, generator)
             of = _assign(part, centres)
         else:
@@ -129,7 +133,7 @@ def _piece_of(rows: Tensor, k: int) -> Tensor:
 def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
     """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up to a multiple of
     64."""
-    sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], dtype=torch.float64).square()
+    sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], dtype=torch.float64).sqrt()
     if len(sums[: 2 * most].unique()) > most:
         return None
     ordered, order = sums.sort(stable=True)

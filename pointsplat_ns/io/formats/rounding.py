@@ -39,8 +39,10 @@ class RoundingSettings:
     """Contrast of a Gaussian with what is around it, a share of the colour range."""
     thinnest: float = 0.1
     """Least standard deviation along an axis, as a share of that along the longest: thinner ones are drawn thicker."""
-    rows_per_entry: float = 32.0
-    """Gaussians for each entry of a palette of SH."""
+    palette_error: float = 2.5
+    """Error of the colours of a palette of SH, in tolerances. Finer colours take more bytes than fewer Gaussians."""
+    most_rows: int = 32
+    """Gaussians for each entry of the smallest palette."""
 
 
 ROUNDING = RoundingSettings()
@@ -52,12 +54,10 @@ class Rounding:
 
     tolerance: float
     """Error of the colour of a Gaussian of usual weight, as a share of the colour range; 0 for no rounding."""
-    rows_per_entry: float = ROUNDING.rows_per_entry
-    """Gaussians for each entry of a palette of SH."""
 
-    def finer(self, steps: int) -> Rounding:
+    def finer(self, steps: float) -> Rounding:
         """So many steps finer, each with half of the squared error; coarser where ``steps`` is negative."""
-        return Rounding(self.tolerance * 2 ** (-0.5 * steps), self.rows_per_entry * 2.0**-steps)
+        return Rounding(self.tolerance * 2 ** (-0.5 * steps))
 
 
 def rounding_for(psnr: float) -> Rounding:

@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import keep_usable, replacing
 from pointsplat_ns.io.formats.coding import (
     Array,
@@ -36,7 +38,7 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
-from pointsplat_ns.io.formats.rounding import Rounding, multiples, rounded_shapes, steps_of, weights
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -44,6 +46,7 @@ MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
 
 _ACROSS = 64  # palette entries in one row of pixels
+_MOST_ENTRIES = 65_536  # of a palette
 _LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
 
 
@@ -270,14 +273,31 @@ def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
     outermost = (levels <= 0) | (levels >= 65535)  # they stay, so that levels keep their meaning
     logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, 65535)) / 65535
     means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
-    rest = scene.features_rest
-    if scene.sh_degree:
-        entries = 64 * max(int(len(scene) / (64 * rounding.rows_per_entry)), 1)
-        entries = min(entries, palette_size(len(scene)))
-        book, index = palette(rest.flatten(1), lambda share: None, entries, weights(scene))
-        numbers, number = codebook(book)
-        rest = numbers[number.long()][index].reshape(rest.shape)
+    rest = _few_sh(scene, rounding.tolerance) if scene.sh_degree else scene.features_rest
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
+
+
+def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
+    """SH above degree 0, (N, K, 3), as entries of the smallest palette whose colours have a small enough error, at most
+    one entry for two Gaussians. Its numbers are multiples of their error."""
+    rows, each = scene.features_rest.flatten(1), weights(scene)
+    wanted = ROUNDING.palette_error * tolerance / (SH_C0 * scene.features_rest.shape[1] ** 0.5)
+    most = min(len(scene) // 2, _MOST_ENTRIES)
+
+    def made(share: float) -> tuple[Tensor, Tensor, float]:
+        """A palette of a number of entries, the index of each Gaussian's, and the error of a coefficient."""
+        book, index = palette(rows, lambda done: None, 64 * max(int(share / 64), 1), each)
+        return book, index, float((each @ (book[index] - rows).double().square().mean(dim=1) / each.sum()).sqrt())
+
+    size = len(scene) / ROUNDING.most_rows
+    book, index, error = made(size)
+    while error > wanted and 2 * size <= most:
+        before, size = error, 2 * size
+        book, index, error = made(size)
+        if error < wanted:
+            book, index, error = made(size * (wanted / error) ** (-1 / math.log2(before / error)))
+    numbers, number = codebook((book / error).round() * error if error > 0 else book)
+    return numbers[number.long()][index].reshape(scene.features_rest.shape)
 
 
 def _pack_sh(
