@@ -33,7 +33,7 @@ of the training with a cap are chosen on them.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
   seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - The machine was busy: CPU seconds of equal work differ by up to a half.
-- OpenSplat with its limit of Gaussians is not measured.
+- OpenSplat is not measured: at commit 15b7e80 it has no limit of Gaussians.
 """
 
 HEADS = ("kept", "way", "Gaussians", "CPU s", "with dense", "PSNR", "SSIM", "LPIPS")
