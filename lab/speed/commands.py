@@ -1,11 +1,13 @@
 """Time and memory of whole commands against the number of Gaussians: `prune`, `compact` and splat-transform.
 
     python -m lab.speed.commands --gaussians 100000 300000 1000000 --json commands.json
+    python -m lab.speed.commands --gaussians 1000000 --keep 0.5 --sh-degree 0  # bytes a Gaussian
     python -m lab.speed.commands --ways compact --splat-transform v3/node_modules/.bin/splat-transform
 
-Synthetic scenes are made smaller to a tenth, from file to file, each in a process of its own: seconds, CPU seconds and
-peak memory are those of that process, with starting it. The slope of log time over log Gaussians is 1 where time is
-linear; "beyond the start" leaves out what a scene of 1,000 Gaussians takes.
+Synthetic scenes are made smaller, by default to a tenth, from file to file, each in a process of its own: seconds, CPU
+seconds and peak memory are those of that process, with starting it. The slope of log time over log Gaussians is 1 where
+time is linear; "beyond the start" leaves out what a scene of 1,000 Gaussians takes. Bytes a Gaussian are the peak
+memory beyond the start and the size of the file.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ HELD_BY_WRITING = 2.5
 """Memory that making and writing a scene takes, in sizes of its file: the tensors, one copy, the records."""
 
 
-def rows_of(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer]) -> Iterator[Row]:
+def rows_of(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer], keep: float) -> Iterator[Row]:
     """What each program takes for each size of scene, the smallest first.
 
     A size that is expected to need more memory or disk than is free is left out; ``failed`` says so.
@@ -45,7 +47,7 @@ def rows_of(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer]) ->
         with tempfile.TemporaryDirectory() as folder:
             source = Path(folder) / "dense.ply"
             size = ply_bytes(n, sh_degree)
-            no_room = _more_than("disk", (1 + KEEP) * size, shutil.disk_usage(folder).free)
+            no_room = _more_than("disk", (1 + keep) * size, shutil.disk_usage(folder).free)
             no_room = no_room or _more_than("memory", HELD_BY_WRITING * size, psutil.virtual_memory().available)
             if not no_room:
                 write_ply(room(n, sh_degree), source)
@@ -56,7 +58,7 @@ def rows_of(counts: tuple[int, ...], sh_degree: int, programs: list[Reducer]) ->
                 row["failed"] = no_room or _more_than("memory", expected, psutil.virtual_memory().available)
                 if not row["failed"]:
                     try:
-                        small, usage = program.reduce(source, count_of(KEEP, n))
+                        small, usage = program.reduce(source, count_of(keep, n))
                         row |= {"count": len(small), **vars(usage)}
                         before[program.label] = row
                     except ProgramFailed as error:
@@ -89,9 +91,9 @@ def slopes(rows: list[Row]) -> list[Row]:
     return result
 
 
-def tables(rows: list[Row]) -> Iterator[Table]:
+def tables(rows: list[Row], keep: float) -> Iterator[Table]:
     """Time and memory by size and program, in times of the first program's too; then the slopes."""
-    lines = []
+    lines, begun = [], {row["method"]: row["peak_bytes"] for row in rows if row["gaussians"] == START}
     for n, same in grouped(rows, lambda row: row["gaussians"]).items():
         ours = same[0]
         for row in same:
@@ -99,11 +101,12 @@ def tables(rows: list[Row]) -> Iterator[Table]:
                 lines.append([f"{n:,}", row["method"], row["failed"][:40]])
                 continue
             times = [row[key] / ours[key] if ours[key] else None for key in ("seconds", "peak_bytes")]
-            beyond = number(2)((row["peak_bytes"] - row["file_bytes"]) / n / 1e3)
+            held = row["file_bytes"] + (begun[row["method"]] or 0)
+            beyond = number(0)((row["peak_bytes"] - held) / n) if n > START else ""
             cells = [number(1)(row["seconds"]), number(1)(row["cpu_seconds"]), megabytes(row["peak_bytes"]), beyond]
             lines.append([f"{n:,}", row["method"], *cells, *map(number(2), times)])
-    heads = ("Gaussians", "command", "s", "CPU s", "peak MB", "kB a Gaussian", "times s", "times MB")
-    title = f"to {KEEP:.0%}, from file to file; kB a Gaussian: peak memory beyond the file's size"
+    heads = ("Gaussians", "command", "s", "CPU s", "peak MB", "bytes a Gaussian", "times s", "times MB")
+    title = f"to {keep:.0%}, from file to file; bytes a Gaussian: peak memory beyond the start and the file's size"
     yield table(title, heads, lines, left=["command"])
     names = {"seconds": "s", "seconds_beyond_start": "s beyond the start", "cpu_seconds": "CPU s"}
     names["cpu_seconds_beyond_start"] = "CPU s beyond the start"
@@ -116,6 +119,7 @@ def main(
     ways: tuple[Way, ...] = ("prune",),
     splat_transform: tuple[str, ...] = (),
     sh_degree: int = 3,
+    keep: float = KEEP,
     json: Path | None = None,
 ) -> None:
     """Print what making synthetic scenes smaller takes.
@@ -125,15 +129,16 @@ def main(
         ways: prune, compact, and thorough: compact with that effort.
         splat_transform: programs, of any versions, each of whose modes is measured too.
         sh_degree: of the scenes.
+        keep: share of the Gaussians that remains.
         json: write all rows there, after each.
     """
     rows: list[Row] = []
-    for row in rows_of(gaussians, sh_degree, programs_of(ways, splat_transform)):
+    for row in rows_of(gaussians, sh_degree, programs_of(ways, splat_transform), keep):
         rows.append(row)
         took = row["failed"] or f"{row['seconds']:.1f} s, {megabytes(row['peak_bytes'])} MB"
         print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
         write_json(json, {"rows": rows, "slopes": slopes(rows)})
-    console().print(*tables(rows))
+    console().print(*tables(rows, keep))
 
 
 if __name__ == "__main__":

@@ -120,6 +120,7 @@ def regrouped(
     ratios = alphas * areas / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):
         group = best_groups(members, group, common, settings)
+        del common
         common = group_moments(members, group, count)
     alphas = torch.where(
         common.mass > MIN_DIVISOR, ratios * common.mass / areas_of(common.cov).clamp_min(MIN_DIVISOR), alphas
