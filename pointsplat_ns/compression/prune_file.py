@@ -37,13 +37,15 @@ class MemorySettings:
     """Bytes for each Gaussian of a scene in memory, beside the scene itself."""
     cell: int = 400
     """Bytes for each Gaussian of a cell: what follows from the whole scene is known before."""
-    base: int = 1_050_000_000
+    base: int = 900_000_000
     """Bytes of the interpreter, torch and a thinned scene."""
     most: int = 4_000_000
     """Largest number of Gaussians in a cell. More memory than it needs changes nothing, so that a result does not
     depend on the memory that happens to be free."""
     least: int = 100_000
     """Smallest number of Gaussians in a cell."""
+    between: int = 150
+    """Bytes on disk for each Gaussian between rounds, beside its row and its share of the result."""
 
 
 MEMORY = MemorySettings()
@@ -156,8 +158,8 @@ def prune_file(
         assert count is not None
         return count
 
-    count_of(rows.count)  # errors before the work
-    size = rows.count * (_row_bytes(rows) + 350)
+    count = count_of(rows.count)  # errors before the work
+    size = rows.count * (_row_bytes(rows) + MEMORY.between) + count * _row_bytes(rows)
     scratch = first_alone(lambda: Scratch(output.with_name(f".{output.name}.cells"), work, size))
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
     before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress)

@@ -262,8 +262,10 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     most = min(n - k, most_pairs(n, settings))
     near = other_neighbours(step.state.means.double(), settings.neighbours)
     give_back_freed_memory()
-    first, second = cheapest_pairs(near, pair_costs(step.state, near, settings), most, settings.matching_passes)
-    del near
+    costs = pair_costs(step.state, near, settings)
+    give_back_freed_memory()
+    first, second = cheapest_pairs(near, costs, most, settings.matching_passes)
+    del near, costs
     give_back_freed_memory()
     state, shares = replace_pairs(step.state, first, second, settings)
     tree = step.tree.after_round(first, second, shares)
