@@ -98,6 +98,10 @@ class Adam:
         moves = self.moves(share, factors)
         return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
 
+    def root_mean_square(self, name: str) -> Tensor:
+        """Root of the mean square of the gradients by a parameter so far, (K,): over steps, summed over components."""
+        return (self._second[name] / self._weight_sum(1)).flatten(1).sum(1).sqrt()
+
     def _weight_sum(self, which: int) -> float:
         """The sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""
         return 1 - self._settings.betas[which] ** self._steps

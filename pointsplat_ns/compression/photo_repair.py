@@ -4,10 +4,13 @@ A repair against renders of the dense scene cannot be better than these. Photos 
 pixel of a photo and a step of Adam on 0.8 L1 + 0.2 (1 - SSIM), as the training of 3DGS does. Few pixels allow many
 steps. Every eighth step takes a render of the dense scene in a view that no photo has, which holds the parts that
 photos show little of. Every eighth photo takes part in no step. The scene that is closest to those is the result.
+
+A few times, Gaussians are split where the loss pulls at them most, and merging makes them as many as before.
 """
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +21,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised, size_factors
+from pointsplat_ns.compression.reallocation import reallocated
 from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
@@ -53,6 +57,14 @@ class PhotoSettings:
     them lose 0.2 dB (vr_project), and sampled views gain 1 dB."""
     dense_views: int = 32
     """Number of the views of these renders."""
+    moves: int = 5
+    """Number of times that Gaussians are moved (:mod:`~pointsplat_ns.compression.reallocation`) to where the gradients
+    by their means, in units of their size, are largest. At a tenth, held-out photos gain
+    0.5 dB (fox) and 0.2 dB (vr_project). Twice as often is 0.1 dB better in one of them."""
+    moved_share: float = 0.2
+    """Share of the Gaussians that is split each time."""
+    moved_until: float = 0.5
+    """Share of the steps that is done the last time."""
     checks: int = 8
     """Number of times that the scene is compared with the unseen photos."""
     min_gain: float = 0.1
@@ -126,14 +138,28 @@ def photo_repair(
             if (psnr := _psnr(scene, photos, unseen)) > after:
                 best, after = scene, psnr
 
-    rates = {**RATES, "means": PHOTO_REPAIR.means_rate}
-    adam = Adam(scene, AdamSettings(faster=PHOTO_REPAIR.faster), rates)
-
-    def choose(scene: Gaussians) -> tuple[float, Tensor]:
-        return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
-
-    run.take(optimised(scene, adam, _examples(photos, used, dense, views), choose), compare, progress)
+    run.take(_scenes(scene, _examples(photos, used, dense, views), views, run), compare, progress)
     return PhotoRepaired(best, before, after, len(used), len(unseen), run.count, run.seconds, run.interrupted)
+
+
+def _scenes(
+    scene: Gaussians, examples: Iterator[Example], views: ViewSource, run: OptimisationRun
+) -> Iterator[Gaussians]:
+    """The scene after each step of a run, without end."""
+    rates = {**RATES, "means": PHOTO_REPAIR.means_rate}
+    for turn in counted(1):
+        adam = Adam(scene, AdamSettings(faster=PHOTO_REPAIR.faster), rates)
+
+        def choose(scene: Gaussians, adam: Adam = adam) -> tuple[float, Tensor]:
+            return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
+
+        until = PHOTO_REPAIR.moved_until * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
+        for stepped in optimised(scene, adam, examples, choose):
+            yield (scene := stepped)
+            if run.done >= until:
+                break
+        pull = adam.root_mean_square("means") * size_factors(scene, adam.reach)[:, 0]
+        scene = reallocated(scene, pull, PHOTO_REPAIR.moved_share, views.for_merging())
 
 
 @torch.no_grad()
