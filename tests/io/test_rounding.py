@@ -1,6 +1,8 @@
 """Rounding, rows and palettes."""
 
+import json
 import math
+import zipfile
 
 import pytest
 import torch
@@ -187,3 +189,17 @@ def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
         )
         assert errors[-1] < 1.1 * ROUNDING.palette_error * tolerance or numbers[-1] > 1000
     assert 64 <= numbers[0] < numbers[1] < numbers[2] <= 2000 and errors[0] > errors[1] > errors[2]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+def test_codebooks_are_listed_in_few_digits_and_read_back_to_the_bit(tolerance, tmp_path):
+    kind = format_to_write(".sog")
+    scene = kind.rounded(ps.example_room()[::20], Rounding(tolerance))
+    kind.write(scene, tmp_path / "a.sog", SILENT)
+    meta = json.loads(zipfile.ZipFile(tmp_path / "a.sog").read("meta.json"))
+    for name, values in (("scales", scene.scales), ("sh0", scene.features_dc)):
+        book, _ = codebook(values)
+        listed = torch.tensor(meta[name]["codebook"])
+        used = book < book[-1]
+        assert len(listed) == 256 and torch.equal(listed[used], book[used]) and float(book[-1]) in listed
+        assert all(len(repr(number)) <= 16 for number in meta[name]["codebook"])

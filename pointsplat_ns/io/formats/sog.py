@@ -234,10 +234,10 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
             "maxs": maxs.tolist(),
             "files": add("means_l.webp", [steps & 255]) + add("means_u.webp", [steps >> 8]),
         },
-        "scales": {"codebook": scales.tolist(), "files": add("scales.webp", [scale_index.numpy()])},
+        "scales": {"codebook": _short(scales), "files": add("scales.webp", [scale_index.numpy()])},
         "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), _LARGEST + largest])},
         "sh0": {
-            "codebook": colors.tolist(),
+            "codebook": _short(colors),
             "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
         },
     }
@@ -250,6 +250,13 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
         progress("compressing", done / len(images))
         files[name] = webp(*image)
     return {META: json.dumps(meta).encode(), **files}
+
+
+def _short(book: Tensor) -> list[float]:
+    """An ascending codebook, float32, in no more digits than tell its numbers apart. Copies of the last are zeros,
+    which no index reaches."""
+    last = int((book < book[-1]).sum())
+    return [float(f"{value:.9g}") for value in book[: last + 1].tolist()] + [0] * (len(book) - last - 1)
 
 
 def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
@@ -314,6 +321,6 @@ def _pack_sh(
     return {
         "count": len(rows),
         "bands": scene.sh_degree,
-        "codebook": levels.tolist(),
+        "codebook": _short(levels),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
