@@ -16,8 +16,8 @@ from pointsplat_ns.views import Views
 APART = 0.5
 """Distance of each half from the centre of a Gaussian that is split, in its largest standard deviations."""
 
-NARROWER = 0.6
-"""Largest standard deviation of a half, as a share of the whole's."""
+NARROWER = math.sqrt(1 - APART**2)
+"""Largest standard deviation of a half, as a share of the whole's: both together have the whole's second moments."""
 
 
 @torch.no_grad()
