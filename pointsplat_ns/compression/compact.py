@@ -215,8 +215,7 @@ def compact_scene(
     if photos is not None and request.photos is not None and not request.photos.empty and not stopped:
         stages.append(_on_photos(_last_kept(stages), at_work, request.photos, photos, judge, views, progress))
     if pruned.limit is not None:
-        rounded = _round(_last_kept(stages), pruned.limit, judge)
-        stages += [] if rounded is None else [rounded]
+        stages += rounding_stage(_last_kept(stages), pruned.limit, None if judge is None else judge.reference)
     notes = pruned.notes
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
@@ -279,13 +278,13 @@ def _repair(
     return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)
 
 
-def _round(last: Stage, limit: FileLimit, judge: Comparison | None) -> Stage | None:
-    """The last scene, rounded for a file of limited size; None if it fits as it is."""
+def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | None) -> list[Stage]:
+    """The last scene, rounded for a compressed file; empty if it is kept as it is."""
     scene = limit.rounded(last.scene)
     if scene is last.scene:
-        return None
-    after = None if judge is None else judge.reference.closeness(scene.to(judge.device))
-    return Stage("round", scene, after, last.after)
+        return []
+    after = None if reference is None else reference.closeness(scene.to(reference.renders[0].device))
+    return [Stage("round", scene, after, last.after)]
 
 
 def _on_photos(

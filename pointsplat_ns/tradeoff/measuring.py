@@ -14,13 +14,15 @@ from typing import Any
 
 from torch import Tensor
 
-from pointsplat_ns.compression.compact import Compacted, compact_scene
+from pointsplat_ns.compression.budget_search import FileLimit
+from pointsplat_ns.compression.compact import Compacted, compact_scene, rounding_stage
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import ViewSource
@@ -191,10 +193,24 @@ class Measurer:
     def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
         """The scene of a setting. The latest scenes are kept, with no more Gaussians in all than the dense scene."""
         if setting not in self._kept:
-            self._kept[setting] = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
+            made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
+            self._kept[setting] = self._rounded(made)
             while len(self._kept) > 1 and sum(len(kept.scene) for kept in self._kept.values()) > len(self.dense):
                 self._kept.pop(next(iter(self._kept)))
         return self._kept[setting]
+
+    def _rounded(self, made: MadeScene) -> MadeScene:
+        """The scene of a compressed file: its numbers are rounded as far as its error allows, as by ``--keep auto``."""
+        kind = format_to_write(self.subject.suffix)
+        if kind.rounded is None or (psnr := self.judge.psnr(made.scene)) > ROUNDING.best_psnr:
+            return made
+        limit, compacted = FileLimit(kind, math.inf, rounding_for(psnr)), made.compacted
+        if compacted is None:
+            return replace(made, scene=limit.rounded(made.scene))
+        compacted = replace(
+            compacted, stages=(*compacted.stages, *rounding_stage(compacted.last, limit, compacted.reference))
+        )
+        return replace(made, scene=compacted.scene.to(made.scene.device), compacted=compacted)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

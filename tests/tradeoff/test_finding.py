@@ -43,7 +43,7 @@ def mean_psnr(scene, dense, views) -> float:
     return float(ps.psnr(ps.render(scene, views), ps.render(dense, views)).mean())
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, suffix):
     found = ps.compact(dense, by="opacity", target_db=25.0, target_format=suffix)
     ps.save(found.scene, tmp_path / f"found{suffix}")
@@ -53,7 +53,7 @@ def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, s
     assert "the next cheaper, " in found.target and "dB where 25 are wanted" in found.target
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_the_file_that_is_written_fits_and_leaves_little_unused(dense, tmp_path, suffix):
     ps.save(dense, tmp_path / f"whole{suffix}")
     limit = 0.5e-6 * (tmp_path / f"whole{suffix}").stat().st_size
