@@ -213,19 +213,23 @@ class FileLimit:
             if self.most == math.inf or self.bytes_of(written) <= self.most:
                 return scene
             rounding = rounding_for(math.inf)
-        best, largest, steps = self.kind.rounded(written, rounding), 0, 0.0
+        best = tried = self.kind.rounded(written, rounding)
         if self.most == math.inf:
             return best.to(scene.device)
-        for _ in range(BUDGETS.roundings):
-            tried = self.kind.rounded(written, rounding.finer(steps)) if steps else best
-            size = self.bytes_of(tried)
-            if largest < size <= self.most or not largest:
-                best, largest = tried, size if size <= self.most else 0
-            room = math.log(self.most / size)
+        steps, fits, exceeds = 0.0, -math.inf, math.inf  # steps finer: those tried, the most that fit, the next
+        for number in range(BUDGETS.roundings):
+            tried = self.kind.rounded(written, rounding.finer(steps)) if number else tried
+            room = math.log(self.most / self.bytes_of(tried))
+            if room >= 0:
+                best, fits = tried, steps
+            else:
+                exceeds = steps
             if 0 <= room <= BUDGETS.room:
                 break
             steps += (room - 0.5 * BUDGETS.room) / BUDGETS.bytes_of_step
-        return best.to(scene.device)
+            if not fits < steps < exceeds:
+                steps = 0.5 * (fits + exceeds)
+        return (best if fits > -math.inf else tried).to(scene.device)
 
 
 def _as_written(scene: Gaussians) -> Gaussians:

@@ -177,9 +177,8 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
     for one in found.values():
         small = one.limit.rounded(one.scene)
-        assert (
-            len(small) == len(one.scene) and 0.9 * 40_000 < one.limit.bytes_of(small) == one.tried[len(small)] <= 40_000
-        )
+        assert len(small) == len(one.scene) and 0.9 * 40_000 < one.tried[len(small)]
+        assert one.tried[len(small)] <= one.limit.bytes_of(small) <= 40_000
 
 
 def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():
