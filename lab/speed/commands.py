@@ -7,12 +7,13 @@
 Synthetic scenes are made smaller, by default to a tenth, from file to file, each in a process of its own: seconds, CPU
 seconds and peak memory are those of that process, with starting it. The slope of log time over log Gaussians is 1 where
 time is linear; "beyond the start" leaves out what a scene of 1,000 Gaussians takes. Bytes a Gaussian are the peak
-memory beyond the start and the size of the file.
+memory beyond the size of the file and what a process holds that has only imported this package.
 """
 
 from __future__ import annotations
 
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,14 +25,17 @@ from lab.common.printing import console, megabytes, number, start, table
 from lab.common.results import Row, grouped, write_json
 from lab.common.scenes import KEEP, room
 from lab.common.timing import slope
-from lab.common.ways import Way, count_of, programs_of
+from lab.common.ways import WAYS, Way, count_of, programs_of
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.system.programs import ProgramFailed
+from pointsplat_ns.system.programs import ProgramFailed, run_measured
 from pointsplat_ns.tables.making import Reducer
 
 START = 1000
 """Gaussians of the scene that shows what starting a program costs."""
+
+IMPORTS = "import os, tyro, pointsplat_ns.compacting, pointsplat_ns.pruning.merging; os._exit(0)"
+"""What a process does that holds the libraries alone. Unloading torch would take more memory."""
 
 HELD_BY_WRITING = 2.5
 """Memory that making and writing a scene takes, in sizes of its file: the tensors, one copy, the records."""
@@ -93,7 +97,7 @@ def slopes(rows: list[Row]) -> list[Row]:
 
 def tables(rows: list[Row], keep: float) -> Iterator[Table]:
     """Time and memory by size and program, in times of the first program's too; then the slopes."""
-    lines, begun = [], {row["method"]: row["peak_bytes"] for row in rows if row["gaussians"] == START}
+    lines, libraries = [], run_measured([sys.executable, "-c", IMPORTS]).peak_bytes or 0
     for n, same in grouped(rows, lambda row: row["gaussians"]).items():
         ours = same[0]
         for row in same:
@@ -101,12 +105,12 @@ def tables(rows: list[Row], keep: float) -> Iterator[Table]:
                 lines.append([f"{n:,}", row["method"], row["failed"][:40]])
                 continue
             times = [row[key] / ours[key] if ours[key] else None for key in ("seconds", "peak_bytes")]
-            held = row["file_bytes"] + (begun[row["method"]] or 0)
-            beyond = number(0)((row["peak_bytes"] - held) / n) if n > START else ""
+            ours_alone = (row["peak_bytes"] - row["file_bytes"] - libraries) / n
+            beyond = number(0)(ours_alone) if row["method"] in WAYS and n > START else ""
             cells = [number(1)(row["seconds"]), number(1)(row["cpu_seconds"]), megabytes(row["peak_bytes"]), beyond]
             lines.append([f"{n:,}", row["method"], *cells, *map(number(2), times)])
     heads = ("Gaussians", "command", "s", "CPU s", "peak MB", "bytes a Gaussian", "times s", "times MB")
-    title = f"to {keep:.0%}, from file to file; bytes a Gaussian: peak memory beyond the start and the file's size"
+    title = f"to {keep:.0%}, from file to file; bytes a Gaussian: peak memory beyond the file's size and the libraries"
     yield table(title, heads, lines, left=["command"])
     names = {"seconds": "s", "seconds_beyond_start": "s beyond the start", "cpu_seconds": "CPU s"}
     names["cpu_seconds_beyond_start"] = "CPU s beyond the start"
