@@ -168,7 +168,7 @@ def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
-    full, limit = cloud(4000), FileLimit(format_to_write(suffix), 40_000)
+    full, limit = cloud(4000), FileLimit(format_to_write(suffix), 32_000)
     found = {
         psnr: largest_within(full, lambda count: full[:count], limit, lambda share: None, lambda scene, psnr=psnr: psnr)
         for psnr in (25.0, 35.0)
@@ -177,8 +177,8 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
     for one in found.values():
         small = one.limit.rounded(one.scene)
-        assert len(small) == len(one.scene) and 0.9 * 40_000 < one.tried[len(small)]
-        assert one.tried[len(small)] <= one.limit.bytes_of(small) <= 40_000
+        assert len(small) == len(one.scene) and 0.9 * 32_000 < one.tried[len(small)]
+        assert one.tried[len(small)] <= one.limit.bytes_of(small) <= 32_000
 
 
 def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():

@@ -102,7 +102,7 @@ def test_a_tolerance_beats_fewer_bits_for_all(tmp_path):
         return len(data), sum(float((render(scene, view) - render(room, view)).square().mean()) for view in views)
 
     size, error = written(encode_spz(room, sh_bits=(3, 3)))
-    smaller, less = written(encode_spz(rounded(room, Rounding(0.01))))
+    smaller, less = written(encode_spz(rounded(room, Rounding(0.007))))
     assert smaller < size and less < error
 
 

@@ -35,7 +35,7 @@ class RoundingSettings:
     """Tolerance as a share of the error that a scene has already, by its PSNR."""
     best_psnr: float = 45.0
     """PSNR, in dB, that a scene without error is taken to have."""
-    contrast: float = 0.35
+    contrast: float = 0.22
     """Contrast of a Gaussian with what is around it, a share of the colour range."""
     thinnest: float = 0.1
     """Least standard deviation along an axis, as a share of that along the longest: thinner ones are drawn thicker."""
