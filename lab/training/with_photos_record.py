@@ -26,10 +26,11 @@ of the training with a cap are chosen on them.
 - CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
   dense training, which all ways need but the training with a cap.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" trains on
-  them for as many seconds (`--seconds`) as the dense training took.
+  them for as many seconds (`--seconds`) of the clock as the dense training took of the processor: about half
+  as many CPU seconds.
 - "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
-  them on the photos as `{COMPACTED}` does, for as many CPU seconds as `{COMPACTED}` takes in all; reading and
-  scores come on top. The methods' own schedules are longer.
+  them on the photos as `{COMPACTED}` does, with its splits and merges, for as many CPU seconds as
+  `{COMPACTED}` takes in all; reading and scores come on top. The methods' own schedules are longer.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
   seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - The machine was busy: CPU seconds of equal work differ by up to a half.
