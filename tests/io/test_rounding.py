@@ -191,6 +191,17 @@ def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
     assert 64 <= numbers[0] < numbers[1] < numbers[2] <= 2000 and errors[0] > errors[1] > errors[2]
 
 
+@pytest.mark.parametrize("different", [1, 300, 700])
+def test_sh_of_few_different_rows_as_in_files_that_have_a_palette_already_keep_them(different):
+    """A palette of twice the entries may then have no error at all."""
+    rows = 3 * rows_of(different, 9)[torch.arange(4000) % different].reshape(4000, 3, 3)
+    rounding = rounding_for(30.0)
+    rest = format_to_write(".sog").rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding).features_rest
+    assert 0.95 * different <= len(rest.flatten(1).unique(dim=0)) <= different
+    error = float((rest - rows).square().mean().sqrt())
+    assert error < ROUNDING.palette_error * rounding.tolerance / (SH_C0 * 3**0.5)
+
+
 @pytest.mark.parametrize("tolerance", [0.0, 0.02])
 def test_codebooks_are_listed_in_few_digits_and_read_back_to_the_bit(tolerance, tmp_path):
     kind = format_to_write(".sog")

@@ -302,7 +302,8 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
         before, size = error, 2 * size
         book, index, error = made(size)
         if error < wanted:
-            book, index, error = made(size * (wanted / error) ** (-1 / math.log2(before / error)))
+            least = max(error, 1e-3 * wanted)  # where no error is left
+            book, index, error = made(size * (wanted / least) ** (-1 / math.log2(before / least)))
     numbers, number = codebook((book / error).round() * error if error > 0 else book)
     return numbers[number.long()][index].reshape(scene.features_rest.shape)
 
