@@ -128,7 +128,7 @@ def first_lines(traits: Traits) -> list[str]:
 
 
 def traits_of(header: Header, path: Path) -> Traits:
-    """The traits of a scene that a header's comments tell; the last comment on each counts. Ways of rendering other
+    """The traits of a scene that a header's comments declare; the last comment on each counts. Ways of rendering other
     than ordinary and antialiased are warned of.
 
     Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``, nerfstudio
