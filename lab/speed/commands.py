@@ -35,8 +35,7 @@ START = 1000
 """Gaussians of the scene that shows what starting a program costs."""
 
 IMPORTS = "import os, tyro, pointsplat_ns.compacting, pointsplat_ns.pruning.merging; os._exit(0)"
-"""What a process does that holds the libraries alone. Unloading torch would take more memory.
-The least of three counts: the system maps more of the libraries at some times than at others."""
+"""What a process does that holds the libraries alone. Unloading torch would take more memory."""
 
 HELD_BY_WRITING = 2.5
 """Memory that making and writing a scene takes, in sizes of its file: the tensors, one copy, the records."""
@@ -96,9 +95,15 @@ def slopes(rows: list[Row]) -> list[Row]:
     return result
 
 
-def tables(rows: list[Row], keep: float) -> Iterator[Table]:
+def library_bytes() -> int:
+    """Memory of the libraries alone, bytes: the least of three counts, as the system maps more of them at some times
+    than at others."""
+    return min(run_measured([sys.executable, "-c", IMPORTS]).peak_bytes or 0 for _ in range(3))
+
+
+def tables(rows: list[Row], keep: float, libraries: int) -> Iterator[Table]:
     """Time and memory by size and program, in times of the first program's too; then the slopes."""
-    lines, libraries = [], min(run_measured([sys.executable, "-c", IMPORTS]).peak_bytes or 0 for _ in range(3))
+    lines = []
     for n, same in grouped(rows, lambda row: row["gaussians"]).items():
         ours = same[0]
         for row in same:
@@ -143,7 +148,7 @@ def main(
         took = row["failed"] or f"{row['seconds']:.1f} s, {megabytes(row['peak_bytes'])} MB"
         print(f"{row['gaussians']:,} {row['method']}: {took}", flush=True)
         write_json(json, {"rows": rows, "slopes": slopes(rows)})
-    console().print(*tables(rows, keep))
+    console().print(*tables(rows, keep, library_bytes()))
 
 
 if __name__ == "__main__":

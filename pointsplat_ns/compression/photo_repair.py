@@ -26,6 +26,7 @@ from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.looking.sizes import RESOLUTION, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
@@ -177,15 +178,16 @@ def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos in random order, each once before any is repeated, and renders of the dense scene; without end."""
-    generator, others = random.Random(0), cycle(islice(views.sampled(), PHOTO_REPAIR.dense_views))
+    generator, places = random.Random(0), islice(views.sampled(), PHOTO_REPAIR.dense_views)
+    renders = cycle(Example(view, render(dense, view)) for view in places)  # which keeps them
     order = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):
         if step % PHOTO_REPAIR.dense_every:
             yield every_kth_pixel(photos[next(order)], PHOTO_REPAIR.step_side, dense.device, generator)
         else:
-            view = next(others)
             with torch.no_grad():
-                yield Example(view, render(dense, view))
+                example = next(renders)
+            yield example
 
 
 def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: random.Random | None = None) -> Example:
@@ -200,8 +202,7 @@ def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: 
     view = photo.view
     k = max(1, max(view.width, view.height) // side)
     left, top = (k // 2 if generator is None else generator.randrange(k) for _ in range(2))
-    image = photo.target[top::k, left::k].to(device)
-    image = image.float() / 255 if image.dtype == torch.uint8 else image
+    image = in_unit_range(photo.target[top::k, left::k].to(device))
     mask = None if photo.mask is None else photo.mask[top::k, left::k].to(device)
     K = view.K.clone()
     K[:2, 2] = (K[:2, 2] - K.new_tensor([left + 0.5, top + 0.5])) / k + 0.5

@@ -1,4 +1,4 @@
-"""Writes images of scenes."""
+"""Images as files and as numbers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.io.files import replacing
+
+
+def in_unit_range(image: Tensor) -> Tensor:
+    """An image of any shape in [0, 1]: bytes count in 255ths, floats stay."""
+    return image.float() / 255 if image.dtype == torch.uint8 else image
 
 
 def write_picture(picture: Tensor, path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.errors import DataError, MissingPackageError, need
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices
@@ -58,7 +59,7 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     scene, frames = _open(path, split)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]
-    photos = [_colours(data) for _, data in shown]
+    photos = [in_unit_range(data["image"][..., :3]).float() for _, data in shown]
     height, width = photos[0].shape[:2]
     if any(photo.shape[:2] != (height, width) for photo in photos):
         raise DataError(f"{scene.run.data}: photos of the {split} split have several sizes; expected one")
@@ -97,12 +98,6 @@ class TrainingPhotos(Sequence[Example]):
         camera, data = self._frames[index]
         view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
         return Example(view, data["image"][..., :3], data.get("mask"))
-
-
-def _colours(data: dict[str, Any]) -> Tensor:
-    """The photo (H, W, 3) in [0, 1] of a frame."""
-    photo = data["image"][..., :3]
-    return photo.float() / 255 if photo.dtype == torch.uint8 else photo.float()
 
 
 def _open(path: Path | str, split: Split, cache_bytes: int = 0) -> tuple[TrainedScene, Frames]:

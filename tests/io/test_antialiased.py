@@ -9,6 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
+from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.spz import write_spz
 from pointsplat_ns.io.ply import PlyRows
@@ -124,8 +125,8 @@ def test_gradients_are_those_of_the_antialiased_picture():
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
-def test_it_stays_on_every_way_through_the_package():
-    scene = trained_so(ball(400, 1))
+def test_it_and_the_declared_up_stay_on_every_way_through_the_package():
+    scene = trained_so(ball(400, 1)).replace(up="-x")
     half = scene[:200]
     small = {
         "parts": half,
@@ -138,7 +139,8 @@ def test_it_stays_on_every_way_through_the_package():
         "compact": ps.compact(scene, 0.3, effort="quick", resolution=(64, 48)).scene,
         "levels": ps.lod(scene, [0.5, 0.2])[-1].scene,
     }
-    assert {name: found.antialiased for name, found in small.items()} == dict.fromkeys(small, True)
+    wanted = dict.fromkeys(small, Traits(True, "-x")) | {"placed": Traits(True, "y")}
+    assert {name: found.traits for name, found in small.items()} == wanted
     assert "antialiased" in repr(half) and "antialiased" not in repr(ball(3))
     assert ps.info(scene).antialiased
 

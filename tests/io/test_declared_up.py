@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, ball, cloud, same_bits, small_refiner
+from making import SHARED_DATA, cloud, same_bits
 from pointsplat_ns.compression.prune_file import prune_file
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.gaussians import Traits
@@ -135,21 +135,6 @@ def test_a_scene_that_is_pruned_in_pieces_has_it_too(tmp_path, room):
         prune_file(rows, tmp_path / f"small_{name}.ply", request, None, up=None if up else Up(direction_of(AXIS)))
     small, wanted = (ps.load(tmp_path / f"small_{name}.ply") for name in ("declared", "named"))
     assert small.up == AXIS and wanted.up is None and same_bits(small, wanted)
-
-
-def test_it_stays_on_every_way_through_the_package():
-    scene = ball(400, 1).replace(up=AXIS)
-    ways = {
-        "parts": scene[:200],
-        "joined": ps.Gaussians.cat([scene[:200], scene[200:]]),
-        "moved": scene.to(torch.float64).detach().map(torch.clone),
-        "merged": ps.prune(scene, 0.3),
-        "by score": ps.prune(scene, 0.3, by="paper"),
-        "refined": ps.refine(scene, small_refiner()),
-        "compact": ps.compact(scene, 0.3, effort="quick", resolution=(64, 48)).scene,
-        "levels": ps.lod(scene, [0.5, 0.2])[-1].scene,
-    }
-    assert {name: way.up for name, way in ways.items()} == dict.fromkeys(ways, AXIS)
 
 
 def test_a_real_room_that_its_estimate_lays_on_its_side_is_upright(tmp_path):

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
@@ -235,5 +236,4 @@ class RenderedDataset:
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         _, data = self._frames[index]
-        image = data["image"]
-        return {**data, "image": image / 255 if image.dtype == torch.uint8 else image}
+        return {**data, "image": in_unit_range(data["image"])}

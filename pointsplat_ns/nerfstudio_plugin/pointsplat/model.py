@@ -24,6 +24,7 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
@@ -268,9 +269,7 @@ class PointSplatModel(SplatfactoModel):
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
         """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha channel."""
-        image = data["image"]
-        image = image.float() / 255 if image.dtype == torch.uint8 else image
-        return self.composite_with_background(image.to(self.device), background)
+        return self.composite_with_background(in_unit_range(data["image"]).to(self.device), background)
 
     # The attributes of a Splatfacto model that nerfstudio's viewer and exporter read.
 

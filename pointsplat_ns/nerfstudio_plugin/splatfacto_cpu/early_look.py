@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.io.pictures import in_unit_range, write_picture
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.system.quantities import seconds_text
 
@@ -132,8 +132,7 @@ class EarlyLook:
         camera = copy.deepcopy(camera)
         camera.rescale_output_resolution(min(1.0, 400 / float(max(camera.width.max(), camera.height.max()))))
         outputs = self._render(camera)
-        photo = data["image"].to(model.device)
-        photo = photo / 255 if photo.dtype == torch.uint8 else photo
+        photo = in_unit_range(data["image"].to(model.device))
         photo = model.composite_with_background(photo, outputs["background"][:1, :1])
         image = outputs["rgb"].clamp(0, 1)
         photo = interpolate(photo.permute(2, 0, 1)[None], size=image.shape[:2], mode="bilinear", antialias=True)
