@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import BudgetError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sizes import parse_resolution
@@ -128,13 +128,10 @@ def goal_of(
     """The goal of a search, from a PSNR against the dense scene's renders in dB, the time of a frame in milliseconds
     and the size of a file of a format in units of 10^6 bytes; None if no target is given. Raises BudgetError if a
     target is not positive, or an option was given that a search decides, such as ``keep``."""
-    if db is ms is mb is None:
-        return None
-    if request.photos is not None:
-        raise BudgetError("a search for targets renders the dense scene alone; expected targets or photos, not both")
     from pointsplat_ns.tradeoff.targets import targets_of
 
-    targets = targets_of(db, ms, mb, keep, request.prune.sh, request.prune.clean, request.repair.seconds)
+    pruning, photos = request.prune, request.photos is not None
+    targets = targets_of(db, ms, mb, keep, pruning.sh, pruning.clean, request.repair.seconds, photos)
     return None if targets is None else Goal(targets, request.repair.effort, suffix)
 
 

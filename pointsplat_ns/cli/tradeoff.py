@@ -19,7 +19,7 @@ def tradeoff(
     points: int = 12,
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
-    repairs: tuple[Literal["none", "refiner", "quick", "thorough"], ...] = ("none", "quick"),
+    repairs: tuple[Literal["none", "refiner", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
     poses: Poses = None,
     resolution: Resolution = None,
@@ -46,7 +46,7 @@ def tradeoff(
         within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
             renders.
         by: methods of prune; the first is measured in detail, others at three budgets.
-        repairs: repairs to try: none, the refiner alone, or compact's efforts quick and thorough.
+        repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
             no photos are used then. By default the views of its dataset, or sampled ones.

@@ -125,6 +125,8 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
     path = Path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such file or folder; expected a nerfstudio run")
+    if not may_be_run(path):
+        raise SceneError(f"{path}: not a nerfstudio run; expected its folder, its {RUN_FILES.config} or a checkpoint")
     chosen = path if path.suffix == ".ckpt" else None
     folder = path if path.is_dir() else path.parent
     if chosen is not None and not (folder / RUN_FILES.config).is_file():

@@ -76,9 +76,7 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
 def training_photos(path: Path | str) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    from pointsplat_ns.nerfstudio_plugin.frames import free_memory_share
-
-    scene, frames = _open(path, "train", free_memory_share())
+    scene, frames = _open(path, "train", cached=True)
     _views_of(scene, frames, "train")
     return TrainingPhotos(scene, frames)
 
@@ -100,8 +98,8 @@ class TrainingPhotos(Sequence[Example]):
         return Example(view, data["image"][..., :3], data.get("mask"))
 
 
-def _open(path: Path | str, split: Split, cache_bytes: int = 0) -> tuple[TrainedScene, Frames]:
-    """The scene of a run, and the frames of a split, of which ``cache_bytes`` are kept."""
+def _open(path: Path | str, split: Split, cached: bool = False) -> tuple[TrainedScene, Frames]:
+    """The scene of a run, and the frames of a split, which stay in memory as far as there is room if ``cached``."""
     run = open_run(path)  # before nerfstudio is imported, which takes seconds
     try:
         need("nerfstudio", "reading the photos and poses of a run")
@@ -109,10 +107,10 @@ def _open(path: Path | str, split: Split, cache_bytes: int = 0) -> tuple[Trained
         raise DataError(str(error)) from error
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
+    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    scene = TrainedScene(scene_name(run), run, MemoryCache(cache_bytes))
+    scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share() if cached else 0))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
 
 

@@ -18,7 +18,7 @@ from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, training_photos
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
@@ -61,7 +61,8 @@ def measure_tradeoff(
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
             expected of its renders (:mod:`~pointsplat_ns.tradeoff.front`).
         by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
-        repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`.
+        repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and
+            "photos", its training on the photos of a run.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
@@ -94,8 +95,9 @@ def measure_tradeoff(
         True
     """
     options = SweepOptions(points, within, tuple(by), tuple(repairs), views)
-    targets, size = targets_of(target_db, target_ms, target_mb), parse_resolution(resolution)
-    upward = up_named(up)
+    on_photos = "photos" in options.repairs
+    targets = targets_of(target_db, target_ms, target_mb, photos=on_photos)
+    size, upward = parse_resolution(resolution), up_named(up)
     path, folder = Path(scene), Path(folder)
     with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
         dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
@@ -109,7 +111,8 @@ def measure_tradeoff(
         )
         subject = subject_of(dense, path, given, resolution=size, up=upward)
         file = None if poses is None else Path(poses)
-        subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file)
+        training = training_photos(path) if on_photos else None
+        subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file, training=training)
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
             return sweep.run()

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compact import Compacted, compact_scene, rounding_stage
+from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
@@ -61,6 +62,8 @@ class Subject:
     """Path of its file of cameras in commands; None if there is none."""
     resolution: tuple[int, int] | None = None
     """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
+    training: Photos | None = None
+    """Its training photos, for the repair ``photos``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +86,11 @@ def make(
     new_views: Callable[[], ViewSource],
     progress: Progress,
     refiner: TrainedRefiner | None = None,
+    training: Photos | None = None,
 ) -> MadeScene:
     """Make the scene of a setting. ``new_views`` makes a source of views; it is called once, so that time and result
-    equal the command's. ``refiner`` is as for :class:`Subject`. Raises KeyboardInterrupt on Ctrl-C, also during a
-    repair."""
+    equal the command's. ``refiner`` and ``training`` are as for :class:`Subject`. Raises KeyboardInterrupt on Ctrl-C,
+    also during a repair."""
     peak, start = PeakMemory(), time.perf_counter()
     sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
     compacted = None
@@ -96,9 +100,9 @@ def make(
     else:
         if setting.repair == "refiner":
             refiner = refiner or load_refiner()
-        budget = RepairBudget(EFFORTS[setting.repair])
-        request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget)
-        compacted = compact_scene(dense, request, new_views(), progress)
+        budget, on_photos = RepairBudget(EFFORTS[setting.repair]), setting.repair == "photos"
+        request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget, photos=on_photos)
+        compacted = compact_scene(dense, request, new_views(), progress, training)
         if compacted.interrupted:
             raise KeyboardInterrupt
         scene, notes = compacted.scene, compacted.notes
@@ -193,7 +197,8 @@ class Measurer:
     def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
         """The scene of a setting. The latest scenes are kept, with no more Gaussians in all than the dense scene."""
         if setting not in self._kept:
-            made = make(self.dense, setting, self.subject.new_views, show, self.subject.refiner)
+            subject = self.subject
+            made = make(self.dense, setting, subject.new_views, show, subject.refiner, subject.training)
             self._kept[setting] = self._rounded(made)
             while len(self._kept) > 1 and sum(len(kept.scene) for kept in self._kept.values()) > len(self.dense):
                 self._kept.pop(next(iter(self._kept)))

@@ -101,7 +101,7 @@ def _draw(axis: Axes, sweep: Tradeoff, cost: Cost, reference: Reference) -> None
 
     front = pareto_front(others, cost, reference, "psnr")
     axis.plot(*at(front), color="0.6", linewidth=1, zorder=1)
-    markers = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D"}
+    markers = {"none": "o", "refiner": "v", "quick": "s", "thorough": "D", "photos": "P"}
     groups: dict[str, list[Point]] = {}
     for point in others:
         groups.setdefault(_group(point, dense), []).append(point)

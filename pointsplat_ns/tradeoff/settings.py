@@ -14,12 +14,12 @@ from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.pruning import method_named, ply_bytes
 from pointsplat_ns.tradeoff.points import Point
 
-Repair = Literal["none", "refiner", "quick", "thorough"]
-"""Kinds of repair: none; the refiner alone; 48 steps; 400 steps."""
+Repair = Literal["none", "refiner", "quick", "thorough", "photos"]
+"""Kinds of repair: none; the refiner alone; 48 steps; 400 steps; 48 steps, then a training on the photos of a run."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
-EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough"}
+EFFORTS: dict[Repair, Effort] = {"refiner": "instant", "quick": "quick", "thorough": "thorough", "photos": "quick"}
 """The effort of ``compact`` for each repair."""
 
 
@@ -89,8 +89,8 @@ class Naming:
         """A name for people."""
         words = [f"{100 * setting.count / self.count:.3g} %" + ("" if setting.by == "merge" else f" by {setting.by}")]
         words += [] if setting.sh_degree == self.sh_degree else [f"SH degree {setting.sh_degree}"]
-        repaired = "refined" if setting.repair == "refiner" else f"repaired ({setting.repair})"
-        words += [] if setting.repair == "none" else [repaired]
+        named = {"none": [], "refiner": ["refined"], "photos": ["trained on photos"]}
+        words += named.get(setting.repair, [f"repaired ({setting.repair})"])
         return ", ".join(words)
 
     def command(self, setting: Setting) -> str:
@@ -108,6 +108,7 @@ class Naming:
         if program == "compact":
             words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
             words += ["--effort", EFFORTS[setting.repair]]
+            words += ["--photos"] if setting.repair == "photos" else []
         return shlex.join([*words, "-o", f"{self.name}_{self.key(setting)}.ply"])
 
 

@@ -70,11 +70,15 @@ def targets_of(
     sh: str = "all",
     clean: bool = False,
     seconds: float | None = None,
+    photos: bool = False,
 ) -> Targets | None:
     """Targets from options that may be missing; None if all are missing. Raises BudgetError if a target is invalid, or
-    an option of ``compact`` that the search decides (keep, sh, clean, seconds) is given with a target."""
+    an option of ``compact`` that the search decides (keep, sh, clean, seconds), or ``photos``, is given with a
+    target."""
     if db is ms is mb is None:
         return None
+    if photos:
+        raise BudgetError("a search for targets renders the dense scene alone; expected targets or photos, not both")
     decided = {"keep": keep is not None, "sh": sh != "all", "clean": clean, "seconds": seconds is not None}
     names = [name for name, given in decided.items() if given]
     if names:

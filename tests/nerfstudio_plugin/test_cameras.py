@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
 import pointsplat_ns as ps
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, eps2d_of, near_plane_of, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
@@ -104,16 +108,47 @@ def run(trained_walls) -> Path:
     return config.parent
 
 
+def mean_psnr(scene: Gaussians, run: Path) -> float:
+    """In the held-out photos of a run, dB."""
+    views, photos = dataset_photos(run, "test", 10)
+    errors = [ps.psnr(ps.render(scene, view), photo) for view, photo in zip(views, photos, strict=True)]
+    return float(torch.stack(errors).mean())
+
+
 def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     found = ps.measure_tradeoff(run, tmp_path / "trade", points=2, repairs=("none",))
     dense, small = found.points
-    views, photos = dataset_photos(run, "test", 10)
-    scene = ps.load(run)
-    errors = [ps.psnr(ps.render(scene, view), photo) for view, photo in zip(views, photos, strict=True)]
-    assert dense.against_photos.psnr == pytest.approx(float(torch.stack(errors).mean()), abs=1e-4)
+    assert dense.against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)
     assert small.against_photos is not None and small.gaussians < dense.gaussians
     assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
     written = json.loads((tmp_path / "trade" / "tradeoff.json").read_text())
     assert written["points"][0]["against_photos"]["psnr"] == dense.against_photos.psnr
+
+
+def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, plain_page, no_lpips, monkeypatch):
+    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
+    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 24)
+    found = ps.measure_tradeoff(run, tmp_path / "trade", points=3, repairs=("none", "photos"))
+    trained = next(point for point in found.points if point.repair == "photos")
+    pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
+    assert trained.against_photos.psnr > pruned.against_photos.psnr + 0.1
+    program, *words = shlex.split(trained.command)
+    assert program == "pointsplat" and "--photos" in words
+    monkeypatch.chdir(tmp_path)
+    main(words)
+    (made,) = tmp_path.glob("*.ply")
+    assert mean_psnr(ps.load(made), run) == pytest.approx(trained.against_photos.psnr, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [({}, "not a nerfstudio run"), ({"target_mb": 1.0}, "expected targets or photos, not both")],
+)
+def test_photos_of_no_run_and_photos_beside_targets_are_refused_at_once(tmp_path, options, error):
+    ps.save(ps.example_room()[::200][:300], tmp_path / "room.ply")
+    with pytest.raises(ps.PointSplatError, match=error):
+        ps.measure_tradeoff(tmp_path / "room.ply", tmp_path / "trade", repairs=("none", "photos"), **options)
+    assert not (tmp_path / "trade" / "points.json").exists()
