@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from tyro.conf import Fixed, Suppress
 
@@ -39,9 +39,12 @@ higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 le
 
 @dataclass
 class PointSplatTrainerConfig(StoppableTrainerConfig):
-    """nerfstudio's trainer, with the learning-rate schedules fitted to the length of the run"""
+    """nerfstudio's trainer, for a number of steps or for a time"""
 
     _target: type = field(default_factory=lambda: PointSplatTrainer)
+    seconds: float | None = None
+    """Train for this time, in place of max_num_iterations: as many steps as fit, with a schedule that ends with it. The
+    time before the checkpoint of load_dir is part of it."""
     rates: Literal["fast", "paper", "authors"] = "fast"
     """Learning rates of the parts of the network: fast trains a small network in a few hundred steps, paper is 1e-5,
     authors is the released code's 1e-6 to 3e-5. Rates set by hand are not changed."""
@@ -49,7 +52,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3 learns faster and
     still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
-    """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps."""
+    """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
     gradient_accumulation_steps: dict[str, int] = field(default_factory=dict)
     """Steps, each on one scene, whose gradients are averaged before an update: ``all 4``, or by part of the network."""
     max_skipped_steps: int = 10
@@ -84,15 +87,19 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             super().save_config()
 
     def setup(self, **kwargs) -> Trainer:
-        """Build the trainer with a copy of this config whose rates are set and whose schedules end with the run.
+        """Build the trainer with a copy of this config whose rates are set.
 
-        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from: a run stopped
-        at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had not been stopped.
+        A resumed run ends ``max_num_iterations`` after the step that it resumes from, or when ``seconds`` are over, and
+        so do its schedules: a run stopped at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had
+        not been stopped.
         """
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise PointSplatError(f"--seconds {self.seconds:g}: expected a finite number above 0")
         config = copy.deepcopy(self)
-        steps = config.first_step() + config.max_num_iterations
+        if config.seconds is not None:
+            config.max_num_iterations = sys.maxsize
         rates = {
             "fast": REFINER_RATES,
             "paper": dict.fromkeys(REFINER_RATES, 1e-5),  # with schedule="step"
@@ -106,14 +113,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             if group["optimizer"].lr == REFINER_RATES.get(name):
                 group["optimizer"].lr = rates[name]
             group["optimizer"].lr *= self.rate_factor
-            schedule = group["scheduler"]
-            if isinstance(schedule, CosineDecaySchedulerConfig) and schedule.max_steps == 0:
-                if self.schedule == "step":
-                    milestones = (max(1, round(0.6 * steps)),)  # 6,000 of 10,000 in the paper
-                    group["scheduler"] = MultiStepSchedulerConfig(max_steps=steps, gamma=0.1, milestones=milestones)
-                    continue
-                schedule.warm_up_end = max(1, round(0.05 * steps))
-                schedule.max_steps = max(steps, schedule.warm_up_end + 1)  # the cosine divides by the difference
         _, together = torchrun_rank()
         if together > 1:  # nerfstudio, which did not start them, takes each for one alone
             kwargs |= {"local_rank": local_rank(), "world_size": together}
@@ -135,7 +134,7 @@ def pointsplat_config() -> TrainerConfig:
         optimizers={
             name: {
                 "optimizer": FusedAdamConfig(lr=rate, eps=1e-15, max_norm=2.0),
-                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.02, max_steps=0),
+                "scheduler": None,  # the trainer's own
             }
             for name, rate in REFINER_RATES.items()
         },

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import functools
+import math
+import sys
+import time
 from collections import defaultdict
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
@@ -22,16 +27,41 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
 
 
+SECONDS_BETWEEN_CHECKPOINTS = 600.0
+"""A training that is killed loses at most this time, however slow its steps are."""
+
+
+def rate_factor_at(share: float, schedule: Literal["cosine", "step"]) -> float:
+    """Learning rate over its peak, when a share of the training has passed. ``cosine``: from 0 linearly to 1 at 5 %,
+    then along a cosine to 0.02 at the end. ``step``: 1, and 0.1 from 60 % on (6,000 of 10,000 steps in the paper)."""
+    if schedule == "step":
+        return 1.0 if share < 0.6 else 0.1
+    warm_up, last = 0.05, 0.02
+    if share < warm_up:
+        return share / warm_up
+    return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(1.0, (share - warm_up) / (1 - warm_up))))
+
+
 class AveragingOptimizers(Optimizers):
     """nerfstudio's optimisers, with gradients averaged over accumulated steps and over processes.
 
     nerfstudio sums accumulated gradients. Their norm, which clipping depends on, would then grow with their number.
-    ``counted`` is the number of accumulated steps by group; the trainer keeps it up to date.
+    ``counted`` is the number of accumulated steps by group; the trainer keeps it up to date. ``factor_after`` is the
+    learning rate over its peak after a number of steps, for groups whose config has no scheduler.
     """
 
-    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[nn.Parameter]], counted: Mapping[str, int]):
+    def __init__(
+        self,
+        config: dict[str, Any],
+        param_groups: dict[str, list[nn.Parameter]],
+        counted: Mapping[str, int],
+        factor_after: Callable[[int], float],
+    ):
         super().__init__(config, param_groups)
         self._counted = counted
+        for name, optimizer in self.optimizers.items():
+            if name not in self.schedulers:
+                self.schedulers[name] = LambdaLR(optimizer, factor_after)
 
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
         """As nerfstudio's, with averaged gradients."""
@@ -48,16 +78,22 @@ class PointSplatTrainer(StoppableTrainer):
     spreads to all.) The step is logged with its scene, counted, and left out of the mean of accumulated gradients. The
     learning-rate schedule still advances, as it counts the steps of the run.
 
-    A checkpoint between two updates holds the gradients accumulated so far.
+    A checkpoint between two updates holds the gradients accumulated so far. Checkpoints also come every
+    :data:`SECONDS_BETWEEN_CHECKPOINTS`.
     """
 
     config: PointSplatTrainerConfig
     pipeline: PointSplatPipeline
+    clock = staticmethod(time.monotonic)
+    """Seconds since any moment."""
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
         super().__init__(config, local_rank, world_size)
         steps = self.config.gradient_accumulation_steps
         self.gradient_accumulation_steps = defaultdict(lambda: steps.get("all", 1), steps)
+        self._latest = self.clock()
+        self._seconds_of_checkpoint = 0.0
+        self._last_step = sys.maxsize
 
     def setup_optimizers(self) -> AveragingOptimizers:
         """The optimisers. Raises PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the
@@ -71,7 +107,29 @@ class PointSplatTrainer(StoppableTrainer):
                 )
         if self.config.max_skipped_steps < 0:
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
-        return AveragingOptimizers(self.config.optimizers.copy(), groups, self.pipeline.training_state.counted)
+        return AveragingOptimizers(
+            self.config.optimizers.copy(),
+            groups,
+            self.pipeline.training_state.counted,
+            lambda steps: rate_factor_at(self.share(steps), self.config.schedule),
+        )
+
+    def share(self, steps: int) -> float:
+        """Share of the training that has passed after a number of steps; with ``seconds``, of the time."""
+        if self.config.seconds is not None:
+            return self.pipeline.training_state.seconds / self.config.seconds
+        return steps / max(1, self._start_step + self.config.max_num_iterations)
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's. Raises PointSplatError if the training has taken all of ``seconds`` before."""
+        super()._load_checkpoint()
+        spent, seconds = self.pipeline.training_state.seconds, self.config.seconds
+        if seconds is not None and spent >= seconds:
+            raise PointSplatError(
+                f"--seconds {seconds:g}: the training has taken {spent:.0f} s up to its checkpoint; expected more, as "
+                "it is the total"
+            )
+        self._seconds_of_checkpoint = spent
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """As nerfstudio's, but skips a step whose loss or gradients are not finite. With a gradient scaler
@@ -101,7 +159,28 @@ class PointSplatTrainer(StoppableTrainer):
             metrics["Gradients/Total"] = sum(norms.values())
         if skip and state.skipped.total() > self.config.max_skipped_steps:
             self._stop(step)
+        if state.seconds - self._seconds_of_checkpoint >= SECONDS_BETWEEN_CHECKPOINTS:
+            self.save_checkpoint(step)
         return loss, losses, metrics
+
+    def _count_seconds(self, step: int) -> None:
+        """Count the time since the step before, and end the training after this one if the time is over. The first
+        process's clock counts in all."""
+        state, now = self.pipeline.training_state, self.clock()
+        (state.seconds, *_), self._latest = processes.gathered([state.seconds + now - self._latest]), now
+        if self.config.seconds is None:
+            return
+        share = self.share(step)
+        # nerfstudio says the time left by the number of steps.
+        writer.GLOBAL_BUFFER["max_iter"] = round((step + 1) / min(share, 1.0)) if share > 0 else sys.maxsize
+        if share >= 1:
+            self.stop_training, self._last_step = True, step
+            CONSOLE.log(f"the time is over: {step + 1} steps in {state.seconds:.0f} s")
+
+    def _after_train(self) -> None:
+        """As nerfstudio's, which counts the step before which it stops as done."""
+        self.step = min(self.step, self._last_step)
+        super()._after_train()
 
     def _faults_of_gradients(self) -> list[str]:
         """One text for each part of the network with a gradient that is not finite."""
@@ -129,7 +208,8 @@ class PointSplatTrainer(StoppableTrainer):
                 CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
 
     def _update(self, step: int, due: list[str]) -> None:
-        """Step the optimisers of the parts of the network that are due for an update, and all schedules."""
+        """Step the optimisers of the parts of the network that are due for an update, the clock, and all schedules."""
+        self._count_seconds(step)
         scale = self.grad_scaler.get_scale()
         if due:
             self.optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
@@ -154,3 +234,4 @@ class PointSplatTrainer(StoppableTrainer):
         for name in self.pipeline.training_state.waiting:
             processes.average_gradients(self.optimizers.parameters[name])  # over processes, so that all hold the same
         super().save_checkpoint(step)
+        self._seconds_of_checkpoint = self.pipeline.training_state.seconds

@@ -14,13 +14,15 @@ Gradients = list[tuple[nn.Parameter, Tensor]]
 
 
 class TrainingState:
-    """The scenes that a network has been trained on, the skipped steps, and accumulated gradients, by part of the
-    network."""
+    """The scenes that a network has been trained on, the time, the skipped steps, and accumulated gradients, by part of
+    the network."""
 
     def __init__(self, parts: Mapping[str, list[nn.Parameter]], trained_on: Iterable[str] = ()):
         self._parts = parts
         self.trained_on = set(trained_on)
         """Identities of the scenes that the network has been trained on, also before it was resumed."""
+        self.seconds = 0.0
+        """Duration of the training so far, also before it was resumed."""
         self.skipped: Counter[str] = Counter()
         """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
         self.counted: Counter[str] = Counter()
@@ -56,6 +58,7 @@ class TrainingState:
     def to_dict(self) -> dict[str, Any]:
         """The state as a dictionary, for a checkpoint."""
         state: dict[str, Any] = {"trained_on": sorted(self.trained_on), "skipped": dict(self.skipped)}
+        state["seconds"] = self.seconds
         if self.waiting:
             state["gradients"] = {name: [p.grad for p in self._parts[name]] for name in self.waiting}
             state["counted"] = {name: self.counted[name] for name in self.waiting}
@@ -70,6 +73,7 @@ class TrainingState:
         self.waiting = list(state.get("gradients", {}))
         self.counted.clear()  # and not another one, as the trainer holds it
         self.counted.update(state.get("counted", {}))
+        self.seconds = state.get("seconds", 0.0)
         there = set(scenes)
         self.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
         self.trained_on |= set(state["trained_on"])

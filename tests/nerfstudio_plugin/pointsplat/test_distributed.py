@@ -3,12 +3,14 @@
 import os
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 from unittest import mock
 
 import pytest
 import torch
 import torch.distributed as dist
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import nn
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
@@ -19,6 +21,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
+from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.refiner.encoder import BatchNorm
 from pointsplat_ns.system.processes import average_gradients, gathered
 
@@ -36,7 +39,7 @@ def config_of(data: Path, output_dir: Path, steps: int):
     config.timestamp, config.steps_per_eval_image = "now", 0
     config.pipeline.datamanager.sampled_poses, config.pipeline.datamanager.sampled_size = 5, (32, 24)
     for group in config.optimizers.values():
-        group["scheduler"], group["optimizer"].lr = None, 1e-3
+        group["scheduler"], group["optimizer"].lr = ExponentialDecaySchedulerConfig(), 1e-3  # to the same rate
     return config
 
 
@@ -89,6 +92,14 @@ def resumed(rooms: Path, folder: Path, name: str, rank: int) -> list[dict]:
     return [whole, train(rest, world_size=2)]
 
 
+def timed(rooms: Path, folder: Path, rank: int) -> dict:
+    """A training for 25 seconds of two processes whose clocks differ: ten seconds a step, and a thousand."""
+    config = config_of(rooms, folder / f"timed{rank}", 100)
+    config.seconds = 25.0
+    with mock.patch.object(PointSplatTrainer, "clock", count(0.0, 1000.0 if rank else 10.0).__next__):
+        return train(config, world_size=2)
+
+
 def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
     """Two steps of a batch norm in training, the gradients of a weighted sum of what comes out, and its statistics."""
     x = x.clone().requires_grad_()
@@ -121,6 +132,7 @@ def work(rank: int, folder: Path) -> None:
     found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2, judged=True)
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
         found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank)
+    found["timed"] = timed(folder / "rooms", folder, rank)
     x, weights = rows()
     mine = slice(0, 3) if rank == 0 else slice(3, ROWS)
     norm = nn.Sequential(BatchNorm(CHANNELS).double())
@@ -219,6 +231,12 @@ def test_what_one_process_cannot_use_all_leave_out(together):
             assert error < 1e-3, (name, float(error))  # as above
     assert found[0]["skipping"][0]["skipped"] == found[1]["skipping"][0]["skipped"]
     assert sum(alone["skipping"]["skipped"].values()) == 4
+
+
+def test_the_first_process_says_when_the_time_is_over(together):
+    ours, theirs = (part["timed"] for part in together[0])
+    assert len(ours["losses"]) == len(theirs["losses"]) == 3
+    assert f"step-{2:09d}.ckpt" in ours["files"]
 
 
 def test_batch_norm_is_that_of_all_points(together):

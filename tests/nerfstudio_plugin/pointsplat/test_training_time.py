@@ -1,0 +1,111 @@
+"""Trainings for a time instead of a number of steps. The clock is the test's: it goes on by some seconds a step."""
+
+import math
+from itertools import count
+from unittest import mock
+
+import pytest
+import torch
+from nerfstudio.utils import writer
+
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+from making import dense_config, equal
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.pointsplat import trainer as module
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer, rate_factor_at
+
+STEP = 10.0
+"""Seconds of a step by the test's clock."""
+
+
+@pytest.fixture(autouse=True)
+def steps_of_ten_seconds(monkeypatch):
+    monkeypatch.setattr(PointSplatTrainer, "clock", count(1000.0, STEP).__next__)
+
+
+def timed(three_rooms, folder, seconds, **changes):
+    config = dense_config(three_rooms, folder, 2)  # steps, which do not count
+    config.seconds, config.steps_per_eval_image, config.save_only_latest_checkpoint = seconds, 0, False
+    for name, value in changes.items():
+        setattr(config, name, value)
+    return config
+
+
+def steps_saved(trainer) -> list[int]:
+    return sorted(int(path.stem.split("-")[1]) for path in trainer.checkpoint_dir.glob("*.ckpt"))
+
+
+def saved_seconds(trainer, step: int) -> float:
+    path = trainer.checkpoint_dir / f"step-{step:09d}.ckpt"
+    return torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["seconds"]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "share", "factor"),
+    [
+        ("cosine", 0.0, 0.0),
+        ("cosine", 1e-300, 2e-299),
+        ("cosine", 0.025, 0.5),
+        ("cosine", 0.05, 1.0),
+        ("cosine", 0.525, 0.51),  # half of the way from 1 to 0.02
+        ("cosine", 1.0, 0.02),
+        ("cosine", 1.5, 0.02),
+        ("cosine", 1e300, 0.02),
+        ("step", 0.0, 1.0),
+        ("step", math.nextafter(0.6, 0), 1.0),
+        ("step", 0.6, 0.1),
+        ("step", 1e300, 0.1),
+    ],
+)
+def test_rates_follow_the_share_of_the_training_also_at_extremes(schedule, share, factor):
+    assert rate_factor_at(share, schedule) == pytest.approx(factor, rel=1e-12)
+
+
+def test_training_ends_when_the_time_is_over_with_rates_that_fit_it(three_rooms, run_training, tmp_path):
+    trainer, losses = run_training(timed(three_rooms, tmp_path, 45.0))
+    assert len(losses) == 5, "the step in which the time ends is a whole one"
+    assert steps_saved(trainer) == [4] and saved_seconds(trainer, 4) == 50.0
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in trainer.optimizers.optimizers.items()}
+    assert rates == pytest.approx({name: 0.02 * peak for name, peak in REFINER_RATES.items()}, rel=1e-12)
+    assert (trainer.base_dir / "refiner.safetensors").is_file()
+
+
+def test_rates_and_the_time_left_follow_the_clock(three_rooms, tmp_path):
+    trainer = timed(three_rooms, tmp_path, 100.0).setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.stop_training = False
+    for step in range(4):
+        trainer.pipeline.train()
+        trainer.train_iteration(step)
+        share = (step + 1) * STEP / 100
+        rate = trainer.optimizers.optimizers["means"].param_groups[0]["lr"] / REFINER_RATES["means"]
+        assert rate == pytest.approx(rate_factor_at(share, "cosine"), rel=1e-12)
+        assert writer.GLOBAL_BUFFER["max_iter"] == 10, "steps in all, from which nerfstudio computes the time left"
+    assert not trainer.stop_training
+
+
+def test_resumed_training_ends_as_an_unbroken_one(three_rooms, run_training, tmp_path):
+    whole, losses = run_training(timed(three_rooms, tmp_path / "whole", 80.0, steps_per_save=3))
+    rest = timed(three_rooms, tmp_path / "rest", 80.0, load_dir=whole.checkpoint_dir, load_step=3)
+    resumed, last_losses = run_training(rest)
+    assert len(losses) == 8 and last_losses == losses[4:]
+    assert equal(whole.pipeline.model.refiner.state_dict(), resumed.pipeline.model.refiner.state_dict())
+    rates = [[o.param_groups[0]["lr"] for o in t.optimizers.optimizers.values()] for t in (whole, resumed)]
+    assert rates[0] == rates[1]
+    # one that has taken its time has none left
+    with pytest.raises(PointSplatError, match=r"--seconds 80: the training has taken 80 s .* expected more"):
+        timed(three_rooms, tmp_path, 80.0, load_dir=resumed.checkpoint_dir).setup(local_rank=0, world_size=1).setup()
+
+
+def test_checkpoints_come_by_time_if_steps_are_slow(three_rooms, run_training, tmp_path):
+    with mock.patch.object(module, "SECONDS_BETWEEN_CHECKPOINTS", 3 * STEP):
+        trainer, _ = run_training(timed(three_rooms, tmp_path, 8 * STEP))
+    assert steps_saved(trainer) == [2, 5, 7]
+    assert [saved_seconds(trainer, step) for step in (2, 5, 7)] == [30.0, 60.0, 80.0]
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
+def test_a_time_that_is_none_is_an_error(three_rooms, tmp_path, seconds):
+    with pytest.raises(PointSplatError, match=f"--seconds {seconds:g}: expected a finite number above 0"):
+        timed(three_rooms, tmp_path, seconds).setup(local_rank=0, world_size=1)
