@@ -195,7 +195,7 @@ def compact(
         effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
-            or for ``seconds``. Every eighth photo takes part in no step and says whether the result is better.
+            or for ``seconds``. Photos in and outside of the steps say whether the result is better.
         target_db: least PSNR against the given scene's renders, over the pixels that it covers, dB; in the views of
             held-out photos if the run has any.
         target_ms: longest time of a frame, milliseconds, drawn by this package in these views.

@@ -58,7 +58,7 @@ def main(
     pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, training_photos(run), views, budget)
-    print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in photos that no step used")
+    print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in {trained.compared} photos")
     ps.save(trained.scene, output)
 
 

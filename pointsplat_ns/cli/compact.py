@@ -94,7 +94,7 @@ def compact(
         seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
             the scene so far.
         photos: for a run: after the repair also train on the training photos of its dataset, by 1200 steps (quick)
-            or 12000 (thorough), or for --seconds. Every eighth photo takes part in no step and says whether it helped.
+            or 12000 (thorough), or for --seconds. Photos in and outside of the steps say whether it helped.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
             chooses count, SH degree and repair, in place of --keep and --sh. By default there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best

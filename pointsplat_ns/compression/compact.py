@@ -12,7 +12,7 @@ from typing import Literal
 
 from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
 from pointsplat_ns.compression.budget_search import FileLimit
-from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, PhotoRepaired, Photos, photo_repair
+from pointsplat_ns.compression.photo_repair import PhotoRepaired, Photos, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
 from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget
@@ -128,7 +128,7 @@ class Compacted:
 
     @property
     def photo_psnr(self) -> float | None:
-        """PSNR of ``scene`` in the photos that no step used, dB; None if it was not trained on photos."""
+        """PSNR of ``scene`` in the compared training photos, dB; None if it was not trained on photos."""
         trained = self._stage("photos")
         if trained is None or trained.photos is None:
             return None
@@ -300,7 +300,7 @@ def _on_photos(
     progress("training on photos", 0.0)
     report = functools.partial(progress, "training on photos")
     trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = None if trained.after >= trained.before + PHOTO_REPAIR.min_gain else Reason.SMALL_GAIN
+    reason = None if trained.after > trained.before else Reason.NO_GAIN
     after = None if judge is None else judge.reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
     return Stage("photos", scene, after, last.after, 1.0, reason, *figures, photos=trained)

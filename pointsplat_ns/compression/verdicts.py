@@ -56,7 +56,7 @@ def _line(stage: Stage, result: Compacted) -> str:
 def _photo_line(trained: PhotoRepaired, kept: bool) -> str:
     cost = f"on {trained.used} photos by {trained.steps} steps in {trained.seconds:.1f} s"
     cost += ", interrupted" if trained.interrupted else ""
-    gain = f"{trained.before:.1f} -> {trained.after:.1f} dB PSNR in {trained.unseen} photos that no step used"
+    gain = f"{trained.before:.1f} -> {trained.after:.1f} dB PSNR in {trained.compared} photos"
     return f"trained {cost}: {gain}" if kept else f"not trained {cost}, it does not help: {gain}"
 
 

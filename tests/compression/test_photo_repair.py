@@ -52,7 +52,7 @@ def test_photos_teach_what_the_dense_scene_does_not_know(hollow_ball, pruned, ph
     before, shares = [value.clone() for value in pruned.tensors()], []
     trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"), shares.append)
     assert trained.after > trained.before + 1
-    assert (trained.used, trained.unseen, trained.steps) == (15, 3, 40) and not trained.interrupted
+    assert (trained.used, trained.compared, trained.steps) == (15, 6, 40) and not trained.interrupted
     assert len(trained.scene) == 300 and bool(trained.scene.usable().all())
     assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
     assert shares == pytest.approx([(step + 1) / 40 for step in range(40)])
@@ -65,16 +65,32 @@ def test_unseen_photos_and_held_back_pixels_are_in_no_step(hollow_ball, pruned, 
     )
     photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     unseen = {id(photo) for photo in photos[::8]}
-    assert taken[:3] == [id(photo) for photo in photos[::8]]  # compared before the first step
+    compared, comparisons = taken[:6], 1 + module.PHOTO_REPAIR.checks
+    assert compared[:3] == [id(photo) for photo in photos[::8]] and unseen.isdisjoint(compared[3:])
     # 35 of 40 steps take a photo, 1 of 8 a render of the dense scene; the rest are comparisons.
-    assert sum(photo not in unseen for photo in taken) == 35
+    assert sum(photo in unseen for photo in taken) == 3 * comparisons
+    assert sum(photo not in unseen for photo in taken) == 35 + 3 * comparisons
 
 
-def test_the_scene_that_is_best_in_unseen_photos_is_the_result(hollow_ball, pruned, photos, monkeypatch):
+def test_the_scene_that_is_best_in_the_compared_photos_is_the_result(hollow_ball, pruned, photos, monkeypatch):
     """Steps that are far too long harm: the scene stays as it was."""
     monkeypatch.setattr(module, "PHOTO_REPAIR", dataclasses.replace(module.PHOTO_REPAIR, faster=1e4, last_factor=1.0))
     trained = photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     assert trained.scene is pruned and trained.after == trained.before
+
+
+@pytest.mark.parametrize(("known", "kept"), [(0.6, True), (1.0, False)])
+def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pruned, photos, known, kept):
+    """The given scene knows them in part, as one does that comes from a scene trained on them."""
+    renders = [render(pruned, photo.view).detach() for photo in photos]
+    mixed = [
+        photo if index % 8 else photo._replace(target=photo.target.lerp(known_render, known))
+        for index, (photo, known_render) in enumerate(zip(photos, renders, strict=True))
+    ]
+    trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
+    assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
+    if kept:
+        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.2
 
 
 def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
