@@ -37,6 +37,7 @@ DRAWING = {
     "projection": ("CompiledProject", "Project"),
     "projection, backward": ("CompiledProjectBackward", "ProjectBackward"),
     "colours by SH, both ways": ("CompiledColor", "CompiledColorBackward", "Color", "ColorBackward"),
+    "SSIM, both ways": ("CompiledSimilarity", "CompiledSimilarityBackward"),
 }
 """Events of torch's profiler that are a part of a step."""
 
