@@ -80,7 +80,8 @@ def repair(
         nonlocal scene
         scene = after
 
-    run.take(optimised(scene, feedback, _examples(dense, views), choose), keep, progress)
+    fill_weight = REPAIR.fill_weight * first_factor
+    run.take(optimised(scene, feedback, _examples(dense, views), choose, fill_weight), keep, progress)
     return Repaired(scene, run.count, run.seconds, run.interrupted)
 
 
