@@ -36,7 +36,8 @@ RECORD = Path(__file__).parents[2] / "docs" / "record"
 
 
 def test_page_is_what_the_program_writes_from_the_rows():
-    assert tables_record.page(tables_record.read(RECORD / "results.json")) == (RECORD / "results.md").read_text("utf-8")
+    written = tables_record.page(tables_record.read(RECORD / "results.json"), RECORD / "encoders.json")
+    assert written == (RECORD / "results.md").read_text("utf-8")
 
 
 def test_the_page_of_times_is_what_the_program_writes_from_the_rows():

@@ -1,0 +1,94 @@
+"""What refiners gain over the pruned scene, in views that were chosen by hand: several of one kind, such as seeds.
+
+    python -m lab.judge.refiners scenes/rock.ply --refiners dual=RUN1 dual=RUN2 concat=RUN3 concat=RUN4 \\
+        --by paper --keep 0.1 --json docs/record/encoders.json
+
+A refiner is a run of ``ns-train pointsplat``, a .safetensors file, or ``shipped``. Residuals are taken whole, and
+nothing checks them: ``pointsplat compact`` would leave out what does harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Annotated
+
+import torch
+import tyro
+
+import pointsplat_ns as ps
+from lab.common.printing import console, start, table
+from lab.common.results import Results, Row, grouped
+from lab.judge.ablation import Judge
+from lab.judge.judge import LEAST_WIDTH
+from lab.judge.scenes import check, load
+
+HEADS = ("refiner", "selection", "kept", "trainings", "gain, dB", "spread, dB")
+
+
+def named(text: str) -> tuple[str, str]:
+    """Name and file of a refiner, as in ``dual=RUN``."""
+    name, separator, path = text.partition("=")
+    if not (name and separator and path):
+        raise SystemExit(f"--refiners {text}; expected NAME=RUN, NAME=FILE or NAME=shipped")
+    return name, path
+
+
+def lines(rows: Iterable[Row]) -> list[list[str]]:
+    """Cells of :data:`HEADS` for each name, selection and budget: the number of refiners of the name, the mean of their
+    gains over scenes, and the standard deviation of these means from refiner to refiner."""
+    found = []
+    groups = grouped(rows, lambda row: (row["method"], row["by"], row["keep"]))
+    for (name, by, keep), members in groups.items():
+        one_each = grouped(members, lambda row: row["number"]).values()
+        gains = [fmean(row["psnr"] - row["pruned_psnr"] for row in of_one) for of_one in one_each]
+        spread = f"{stdev(gains):.2f}" if len(gains) > 1 else "-"
+        found.append([name, by, f"{100 * keep:g} %", str(len(gains)), f"{fmean(gains):+.2f}", spread])
+    return found
+
+
+@torch.no_grad()
+def main(
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
+    refiners: tuple[str, ...],
+    keep: tuple[float, ...] = (0.1,),
+    by: tuple[str, ...] = ("paper",),
+    width: int = 960,
+    views: int = 6,
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Print what refiners gain: PSNR over the pixels that the dense scene covers, against its renders.
+
+    Args:
+        scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
+        refiners: NAME=RUN; those of one name are averaged.
+        keep: shares of the Gaussians to keep.
+        by: pruning methods.
+        width: of the pictures of camera paths, pixels; the height is 9/16 of it.
+        views: at most so many views of each scene, evenly spread.
+        json_path: write all rows there, after each scene.
+    """
+    if views < 1 or width < LEAST_WIDTH or not all(0 < share <= 1 for share in keep):
+        raise SystemExit(
+            f"{views} views of width {width}, --keep {keep}; expected 1, {LEAST_WIDTH}, and shares up to 1"
+        )
+    networks = [(name, ps.load_refiner(None if path == "shipped" else path)) for name, path in map(named, refiners)]
+    results = Results(json_path, {"views": views, "width": width}, resume=False)
+    for scene_name, path in zip(check(scenes), scenes, strict=True):
+        scene = load(path, (width,), views)
+        judge, rows = Judge(scene), []
+        for method, share in ((method, share) for method in by for share in keep):
+            small = ps.prune(scene.dense, keep=share, by=method)
+            pruned = judge.psnr(small)
+            for number, (name, network) in enumerate(networks):
+                row: Row = {"scene": scene_name, "digest": scene.digest, "keep": share, "by": method, "method": name}
+                gained = judge.psnr(ps.refine(small, network))
+                rows.append(row | {"number": number, "count": len(small), "pruned_psnr": pruned, "psnr": gained})
+        results.put(scene_name, rows)
+        console().print(table(scene_name, HEADS, lines(rows), left=HEADS[:2]))
+    console().print(table("mean over scenes", HEADS, lines(results.rows), left=HEADS[:2]))
+
+
+if __name__ == "__main__":
+    start(main)
