@@ -30,10 +30,6 @@ class RepairSettings:
     scene. Gains in dB with reduced and with full rates: half of a kettle at 44 dB 1.7 and 0.2, half of a cake at 42 dB
     2.0 and 0.3, half of a room at 40 dB 1.2 and 0. Up to 36 dB, full rates gain most. Tuned on a bouquet, a cake, a
     kettle, a statue and two rooms."""
-    fill_weight: float = 1.5e-4
-    """Weight in the loss of the mean number of Gaussians drawn per pixel; it falls as the rates above ``nearly_right``.
-    Gaussians of which little is seen shrink. At 10 %, a kettle and a bouquet are drawn with 10 % fewer, a room and
-    flowers with 1 to 3 %, at -0.05 to 0 dB; 400 steps draw a kettle with 25 % fewer at -0.1 dB. 4e-4 loses 0.2 dB."""
     last_factor: float = 0.02
     """Factor on the learning rates at the last step, see :func:`~pointsplat_ns.compression.repair.rate_factor`."""
 

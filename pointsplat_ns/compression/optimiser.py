@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.fill import fill_of_view
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render
@@ -124,7 +123,6 @@ def optimised(
     adam: Adam,
     examples: Iterator[Example],
     choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
-    fill_weight: float = 0.0,
 ) -> Iterator[Gaussians]:
     """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
     of a flat axis) do not change.
@@ -135,12 +133,11 @@ def optimised(
         examples: views and their target images, without end.
         choose: from the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`. It is
             called after the gradients of the step are computed.
-        fill_weight: as for :func:`gradients_of`.
     """
     scene = scene.detach()
     while True:
         with suitable_threads(scene.device):
-            adam.observe(gradients_of(scene, *next(examples), fill_weight=fill_weight))
+            adam.observe(gradients_of(scene, *next(examples)))
             scene = adam.moved(scene, *choose(scene))
         yield scene
 
@@ -177,7 +174,6 @@ def gradients_of(
     target: Tensor,
     mask: Tensor | None = None,
     backend: Literal["torch", "auto"] = "torch",
-    fill_weight: float = 0.0,
 ) -> dict[str, Tensor]:
     """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself is not finite.
 
@@ -187,15 +183,11 @@ def gradients_of(
         target: (H, W, 3) target image in [0, 1].
         mask: (H, W, 1) bool, the pixels that count; None for all.
         backend: the rasterizer, as for :func:`pointsplat_ns.rasterizer.render`.
-        fill_weight: weight in the loss of the mean number of Gaussians drawn per pixel.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
         image = render(leaves, view, backend=backend)
-        loss = _loss(*((image, target) if mask is None else (image * mask, target * mask)))
-        if fill_weight:
-            loss = loss + fill_weight * fill_of_view(leaves, view)
-        loss.backward()
+        _loss(*((image, target) if mask is None else (image * mask, target * mask))).backward()
     return {name: _finite_gradient(value) for name, value in leaves.items()}
 
 

@@ -80,8 +80,7 @@ def repair(
         nonlocal scene
         scene = after
 
-    fill_weight = REPAIR.fill_weight * first_factor
-    run.take(optimised(scene, feedback, _examples(dense, views), choose, fill_weight), keep, progress)
+    run.take(optimised(scene, feedback, _examples(dense, views), choose), keep, progress)
     return Repaired(scene, run.count, run.seconds, run.interrupted)
 
 

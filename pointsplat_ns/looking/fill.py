@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.rasterizer.projection import project_scene
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.views import Views
 
 
 @torch.no_grad()
@@ -26,19 +25,14 @@ def fill(scene: Gaussians, views: Views, max_count: int = 100_000) -> float:
     """
     each = max(-(-len(scene) // max_count), 1)
     sample = scene[::each]
-    drawn = sum(float(fill_of_view(sample, view)) for view in views)
-    return drawn * len(scene) / max(len(sample), 1) / len(views)
-
-
-def fill_of_view(scene: Gaussians, view: View) -> Tensor:
-    """:func:`fill` in one view, a float64 scalar, differentiable by the shapes and opacities of the Gaussians. The
-    share of a rectangle that lies in the picture counts as constant."""
-    seen = project_scene(scene, view)
-    square = (2 * (seen.opacities / ALPHA_MIN).log()).clamp(0, 8)  # [M] squared reach in standard deviations
-    area = 4 * square * seen.det.sqrt()  # [M] pixels
-    with torch.no_grad():
-        half = (square[:, None] * seen.cov2d[:, [0, 2]]).sqrt()  # [M, 2] of the box around the ellipse
+    pixels = 0.0
+    for view in views:
+        seen = project_scene(sample, view)
+        reach = (2 * (seen.opacities / ALPHA_MIN).log()).clamp(0, 8).sqrt()  # [M] standard deviations
+        area = 4 * reach.square() * seen.det.sqrt()  # [M] pixels
+        half = reach[:, None] * seen.cov2d[:, [0, 2]].sqrt()  # [M, 2] of the box around the ellipse
         size = half.new_tensor([view.width, view.height])
         low, high = seen.means2d - half, seen.means2d + half
-        sides = (high.minimum(size) - low.clamp_min(0)).clamp_min(0) / (high - low).clamp_min(1e-30)
-    return (area * sides.prod(dim=1)).double().sum() / (view.width * view.height)
+        inside = (high.minimum(size) - low.clamp_min(0)).clamp_min(0) / (high - low)
+        pixels += float((area * inside.prod(dim=1)).double().sum())
+    return pixels * len(scene) / max(len(sample), 1) / (len(views) * views.width * views.height)

@@ -9,16 +9,14 @@ import torch
 import pointsplat_ns.compression.repair as repair_module
 from making import FewViews, same
 from pointsplat_ns.api import example_room
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import View
 
 
 @pytest.fixture(autouse=True)
@@ -43,38 +41,6 @@ def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, 
     assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
     assert repaired.steps == STEPS["quick"] and not repaired.interrupted and repaired.seconds > 0
     assert shares == pytest.approx([(i + 1) / STEPS["quick"] for i in range(STEPS["quick"])])
-
-
-def test_what_hides_behind_others_shrinks():
-    """The picture has no gradient there; that of the fill is the growth of the square drawn."""
-    wall, behind = (
-        Gaussians(
-            torch.tensor([[0.0, 0.0, z]]).repeat(n, 1), torch.full((n, 3), math.log(std)), torch.eye(4)[[0] * n],
-            torch.full((n, 1), 5.0), torch.zeros(n, 3), torch.zeros(n, 0, 3),
-        )
-        for z, std, n in ((2.0, 1.0, 4), (4.0, 0.3, 1))
-    )  # fmt: skip
-    scene = Gaussians(*map(torch.cat, zip(wall.tensors(), behind.tensors(), strict=True)))
-    K = torch.tensor([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
-    example = View(torch.eye(4), K, 64, 48, torch.zeros(3)), torch.zeros(48, 64, 3)
-    without, found = (gradients_of(scene, *example, fill_weight=weight)["scales"][4] for weight in (0.0, 1e-3))
-    assert without.abs().max() < 1e-6
-    variance = (40 / 4 * 0.3) ** 2  # of its projection, pixels^2; the square has 8 * 4 * (variance + 0.3) pixels
-    expected = 1e-3 * 8 * 4 * variance / (64 * 48)
-    assert found[:2].tolist() == pytest.approx([expected, expected], rel=1e-2) and abs(found[2]) < 1e-6
-
-
-def test_fill_hides_no_gradient_of_the_picture(pruned, ball_views):
-    """Its gradients are finite at bounds: axes of length 0, opacities of 1, 0 and 1/255."""
-    scene = pruned.map(torch.clone)
-    scene.opacities[0], scene.scales[1], scene.scales[2, 2] = math.inf, -math.inf, -math.inf
-    scene.opacities[3], scene.opacities[4] = math.log(1 / 254), -math.inf
-    example = ball_views[0], torch.zeros(48, 64, 3)
-    without, found = (gradients_of(scene, *example, fill_weight=weight) for weight in (0.0, 1e-3))
-    for name in ("means", "quats", "features_dc"):
-        assert ((found[name] == 0) == (without[name] == 0)).all(), name
-    moved = (found["scales"] != without["scales"]).any(1)
-    assert moved[5:].any() and bool(((without["scales"] != 0).any(1) <= (found["scales"] != 0).any(1)).all())
 
 
 def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):

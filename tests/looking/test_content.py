@@ -9,7 +9,7 @@ from making import ball, box_room
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
 from pointsplat_ns.looking.coverage import coverage
-from pointsplat_ns.looking.fill import fill, fill_of_view
+from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import render
@@ -111,15 +111,6 @@ FAINT = math.sqrt(2 * math.log(255 * 0.02))  # where an opacity of 0.02 falls to
 )
 def test_fill_is_the_area_of_rectangles_over_that_of_the_picture(scene, pixels):
     assert fill(scene, VIEWS) == pytest.approx(pixels / 10_000, rel=1e-4)  # float32
-
-
-def test_the_gradient_of_fill_agrees_with_float64_differences():
-    scene = flat(0.9, SQUARE, 0.3).to(torch.float64)
-    for name in ("scales", "opacities"):
-        value = getattr(scene, name)
-        assert torch.autograd.gradcheck(
-            lambda x, name=name: fill_of_view(scene.replace(**{name: x}), VIEWS[0]), value.requires_grad_()
-        )
 
 
 def test_a_picture_holds_points_in_front_and_inside_of_its_edges():
