@@ -212,7 +212,7 @@ class FileLimit:
         if rounding is None:
             if self.most == math.inf or self.bytes_of(written) <= self.most:
                 return scene
-            rounding = rounding_for(math.inf)
+            rounding = rounding_for(math.inf, scene.sh_degree)
         best = tried = self.kind.rounded(written, rounding)
         if self.most == math.inf:
             return best.to(scene.device)
@@ -318,7 +318,8 @@ def largest_within(
         scene = full if count == n else make(count)
         written, found = _as_written(scene), limit
         if limit.kind.rounded is not None:
-            rounding = rounding_for(psnr_of(scene) if psnr_of else BUDGETS.unknown_psnr)
+            psnr = few_psnr(psnr_of(scene) if psnr_of else BUDGETS.unknown_psnr, count / n)
+            rounding = rounding_for(psnr, full.sh_degree)
             written, found = limit.kind.rounded(written, rounding), replace(limit, rounding=rounding)
         tried[count] = limit.bytes_of(written)
         if tried[count] <= limit.most:
@@ -336,6 +337,16 @@ def largest_within(
             f"{tried[1] / 1e6:g}MB"
         )
     return best
+
+
+def few_psnr(psnr: float, kept: float) -> float:
+    """PSNR by which the numbers of a scene are rounded that has a PSNR, dB, with a share ``kept`` of the Gaussians.
+
+    The squared error of merging is taken as A (kept^-p - 1): it falls by ``BUDGETS.slope`` for each e-fold of a small
+    count, and to 0 for all Gaussians. A Gaussian more gains the more, the nearer to all they are, so that rounding may
+    cost more: at the best division of bytes, its error is a share of A kept^-p, which few Gaussians have.
+    """
+    return psnr + 10 * math.log10(1 - kept ** (BUDGETS.slope * math.log(10) / 10)) if kept < 1 else psnr
 
 
 def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = BUDGETS.sh_psnr) -> tuple[int, float]:

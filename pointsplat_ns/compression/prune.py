@@ -182,7 +182,7 @@ def _for_psnr(
 
     assert isinstance(budget, WithinPsnr)
     compared, kind = views.compared(), format_to_write(budget.suffix)
-    limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value))
+    limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
     whole: dict[int, Gaussians] = {}  # by count, where the scenes that are compared are rounded
 
     def made(count: int) -> Gaussians:

@@ -209,7 +209,7 @@ class Measurer:
         kind = format_to_write(self.subject.suffix)
         if kind.rounded is None or (psnr := self.judge.psnr(made.scene)) > ROUNDING.best_psnr:
             return made
-        limit, compacted = FileLimit(kind, math.inf, rounding_for(psnr)), made.compacted
+        limit, compacted = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree)), made.compacted
         if compacted is None:
             return replace(made, scene=limit.rounded(made.scene))
         compacted = replace(

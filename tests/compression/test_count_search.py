@@ -1,5 +1,6 @@
 """Searches for a count and for a size."""
 
+import functools
 import math
 
 import pytest
@@ -9,6 +10,7 @@ from pointsplat_ns.compression.budget_search import (
     BUDGETS,
     FileLimit,
     SearchSettings,
+    few_psnr,
     find_count,
     largest_within,
     needed_sh_degree,
@@ -17,8 +19,9 @@ from pointsplat_ns.compression.budget_search import (
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
-from pointsplat_ns.io.formats.rounding import Rounding
+from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
@@ -169,16 +172,38 @@ def test_prune_counts_bytes_of_the_format_that_is_named(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     full, limit = cloud(4000), FileLimit(format_to_write(suffix), 32_000)
+
+    def psnr_of(half: float, scene: Gaussians) -> float:
+        """As of merging: ``half`` with half of the Gaussians, without end with all."""
+        return half - 10 * math.log10(4000 / len(scene) - 1)
+
     found = {
-        psnr: largest_within(full, lambda count: full[:count], limit, lambda share: None, lambda scene, psnr=psnr: psnr)
-        for psnr in (25.0, 35.0)
+        half: largest_within(
+            full, lambda count: full[:count], limit, lambda share: None, functools.partial(psnr_of, half)
+        )
+        for half in (25.0, 35.0)
     }
-    assert found[25.0].limit.rounding.tolerance == pytest.approx(10**0.5 * found[35.0].limit.rounding.tolerance)
+    for half, one in found.items():
+        wanted = rounding_for(few_psnr(psnr_of(half, one.scene), len(one.scene) / 4000), full.sh_degree)
+        assert one.limit.rounding.tolerance == pytest.approx(wanted.tolerance)
     assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
     for one in found.values():
         small = one.limit.rounded(one.scene)
         assert len(small) == len(one.scene) and 0.9 * 32_000 < one.tried[len(small)]
         assert one.tried[len(small)] <= one.limit.bytes_of(small) <= 32_000
+
+
+@pytest.mark.parametrize("kept", [1e-9, 0.1, 0.5, 0.9, 1 - 1e-9])
+def test_the_psnr_of_rounding_falls_by_the_slope_also_where_merging_errs_less_and_less(kept):
+    """If the error of merging is A (kept^-p - 1), rounding goes by A kept^-p."""
+    power = 10 ** (-BUDGETS.slope * math.log(kept) / 10)
+    merged = 40 - 10 * math.log10(power - 1)
+    assert few_psnr(merged, kept) == pytest.approx(40 + BUDGETS.slope * math.log(kept), abs=1e-5)
+    assert few_psnr(merged, kept) < merged or kept < 1e-3
+
+
+def test_all_gaussians_are_rounded_by_their_own_psnr():
+    assert few_psnr(math.inf, 1.0) == math.inf and few_psnr(40.0, 1.0) == 40.0
 
 
 def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():

@@ -47,7 +47,8 @@ def values(scene: Gaussians) -> torch.Tensor:
 
 @pytest.mark.parametrize("psnr", [20.0, 40.0, 80.0, math.inf])
 def test_the_tolerance_is_a_share_of_the_error_that_there_is(psnr):
-    assert rounding_for(psnr).tolerance == pytest.approx(ROUNDING.share * 10 ** (-min(psnr, 45.0) / 20))
+    for sh_degree, share in ((0, ROUNDING.share_without_sh), (1, ROUNDING.share), (3, ROUNDING.share)):
+        assert rounding_for(psnr, sh_degree).tolerance == pytest.approx(share * 10 ** (-min(psnr, 45.0) / 20))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +196,7 @@ def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
 def test_sh_of_few_different_rows_as_in_files_that_have_a_palette_already_keep_them(different):
     """A palette of twice the entries may then have no error at all."""
     rows = 3 * rows_of(different, 9)[torch.arange(4000) % different].reshape(4000, 3, 3)
-    rounding = rounding_for(30.0)
+    rounding = rounding_for(30.0, 1)
     rest = format_to_write(".sog").rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding).features_rest
     assert 0.95 * different <= len(rest.flatten(1).unique(dim=0)) <= different
     error = float((rest - rows).square().mean().sqrt())
