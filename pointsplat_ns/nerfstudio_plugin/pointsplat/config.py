@@ -95,8 +95,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         """
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
-        if self.seconds is not None and not 0 < self.seconds < math.inf:
-            raise PointSplatError(f"--seconds {self.seconds:g}: expected a finite number above 0")
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize

@@ -97,7 +97,7 @@ class PointSplatTrainer(StoppableTrainer):
 
     def setup_optimizers(self) -> AveragingOptimizers:
         """The optimisers. Raises PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the
-        network or a number below 1, or ``max_skipped_steps`` is negative."""
+        network or a number below 1, ``max_skipped_steps`` is negative, or ``seconds`` are not a positive number."""
         groups = self.pipeline.get_param_groups()
         for name, steps in self.config.gradient_accumulation_steps.items():
             if name not in (*groups, "all") or steps < 1:
@@ -107,6 +107,8 @@ class PointSplatTrainer(StoppableTrainer):
                 )
         if self.config.max_skipped_steps < 0:
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
+        if self.config.seconds is not None and not 0 < self.config.seconds < math.inf:  # NaN fails too
+            raise PointSplatError(f"--seconds {self.config.seconds:g}: expected a finite number above 0")
         return AveragingOptimizers(
             self.config.optimizers.copy(),
             groups,

@@ -107,5 +107,8 @@ def test_checkpoints_come_by_time_if_steps_are_slow(three_rooms, run_training, t
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
 def test_a_time_that_is_none_is_an_error(three_rooms, tmp_path, seconds):
+    config = timed(three_rooms, tmp_path, seconds)
+    config.save_config()
     with pytest.raises(PointSplatError, match=f"--seconds {seconds:g}: expected a finite number above 0"):
-        timed(three_rooms, tmp_path, seconds).setup(local_rank=0, world_size=1)
+        config.setup(local_rank=0, world_size=1).setup()
+    assert not config.get_base_dir().exists(), "nothing is left of it"
