@@ -19,8 +19,8 @@ from pointsplat_ns.io.files import replacing
 PAGE = f"""# With the photos at hand
 
 `lab/training/with_photos.py` measures who has the photos, and wants few Gaussians; `lab/training/with_photos_record.py`
-writes this page from [with_photos.json](with_photos.json). Captures are for tuning: constants of `compact --photos` and
-of the training with a cap are chosen on them.
+writes this page from [with_photos.json](with_photos.json). Constants of `compact --photos` and of the training with a
+cap are chosen on fox, kitchen and vr_project. The others judge.
 
 - PSNR, SSIM and LPIPS are means over all held-out photos, at the size of the photos that the dense scene is trained on.
 - CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
@@ -33,6 +33,7 @@ of the training with a cap are chosen on them.
   `{COMPACTED}` takes in all; reading and scores come on top. The methods' own schedules are longer.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
   seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
+- A way without a row was not measured there.
 - The machine was busy: CPU seconds of equal work differ by up to a half.
 - OpenSplat is not measured: at commit 15b7e80 it has no limit of Gaussians.
 """
