@@ -6,29 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from lab.judge import ablation, camera_paths, scenes, variants
+from lab.judge import ablation, scenes, variants
 from lab.judge import ablation_record as record
-from making import box_room
-from pointsplat_ns.io import read_scene, write_ply
+from pointsplat_ns.io import read_scene
 from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 
-PATH = {
-    "scene": "small",
-    "about": "The walls of a room, from its middle.",
-    "up": [0, 0, 1],
-    "field_of_view": 60,
-    "views": [{"eye": [0.2, 0.1, 0], "at": [2, 0, 0]}, {"eye": [0, 0, 0.3], "at": [0, 1.5, 0]}],
-}
 TWO = ("no_regrouping", "growth_0")
-
-
-@pytest.fixture()
-def small(tmp_path, monkeypatch) -> Path:
-    """A room of 900 Gaussians with a path of two views."""
-    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
-    (tmp_path / "small.json").write_text(json.dumps(PATH))
-    write_ply(box_room(seed=3), tmp_path / "small.ply")
-    return tmp_path / "small.ply"
 
 
 def rows_of(path: Path) -> list[dict]:

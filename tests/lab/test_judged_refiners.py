@@ -7,31 +7,19 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from lab.judge import camera_paths, refiners, scenes
-from making import box_room, move_zero_layers
-from pointsplat_ns.io import write_ply
+from lab.judge import refiners, scenes
+from making import move_zero_layers
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
-PATH = {
-    "scene": "small",
-    "about": "The walls of a room, from its middle.",
-    "up": [0, 0, 1],
-    "field_of_view": 60,
-    "views": [{"eye": [0.2, 0.1, 0], "at": [2, 0, 0]}, {"eye": [0, 0, 0.3], "at": [0, 1.5, 0]}],
-}
 
-
-def test_a_refiner_gains_what_its_scene_is_closer_and_an_untrained_one_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
-    (tmp_path / "small.json").write_text(json.dumps(PATH))
-    write_ply(box_room(seed=3), tmp_path / "small.ply")
+def test_a_refiner_gains_what_its_scene_is_closer_and_an_untrained_one_nothing(small, tmp_path):
     torch.manual_seed(0)
     about = {"by": "opacity", "keep": "0.5"}
     save_refiner(Refiner(preset("tiny")), tmp_path / "untrained.safetensors", about)
     save_refiner(move_zero_layers(Refiner(preset("tiny"))), tmp_path / "moved.safetensors", about)
     asked = tuple(f"{name}={tmp_path / name}.safetensors" for name in ("untrained", "moved"))
     options = {"keep": (0.5, 0.25), "by": ("opacity",), "width": 64, "views": 2}
-    refiners.main((tmp_path / "small.ply",), asked, **options, json_path=tmp_path / "rows.json")
+    refiners.main((small,), asked, **options, json_path=tmp_path / "rows.json")
     rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
     assert [(row["method"], row["keep"], row["count"]) for row in rows] == [
         ("untrained", 0.5, 450),
@@ -40,7 +28,7 @@ def test_a_refiner_gains_what_its_scene_is_closer_and_an_untrained_one_nothing(t
         ("moved", 0.25, 225),
     ]
     assert rows[0]["psnr"] == rows[0]["pruned_psnr"] == rows[1]["pruned_psnr"] != rows[1]["psnr"]
-    scene = scenes.load(tmp_path / "small.ply", (64,), 2)
+    scene = scenes.load(small, (64,), 2)
     pruned = ps.prune(scene.dense, keep=0.5, by="opacity")
     [(_, _, expected)] = scenes.losses(scene, [pruned], None)
     assert rows[0]["pruned_psnr"] == expected["covered_psnr"]

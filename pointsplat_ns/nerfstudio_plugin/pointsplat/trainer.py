@@ -17,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from pointsplat_ns.compression.repair import rate_factor
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
@@ -39,7 +40,7 @@ def rate_factor_at(share: float, schedule: Literal["cosine", "step"]) -> float:
     warm_up, last = 0.05, 0.02
     if share < warm_up:
         return share / warm_up
-    return last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(1.0, (share - warm_up) / (1 - warm_up))))
+    return rate_factor(min(1.0, (share - warm_up) / (1 - warm_up)), last)
 
 
 class AveragingOptimizers(Optimizers):
