@@ -71,8 +71,10 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 
     ``log det H`` with ``H = sum over views, pixels and channels of g g^T``, the Gauss-Newton Hessian of the
     squared error of the picture, where g is the gradient of a pixel's channel by the mean (3) and the
-    standard deviations (3) of the Gaussian. It is exact and includes the change of colour with the viewing
-    direction; values clamped at black or at the maximum of alpha have no gradient.
+    log-scales (3) of the Gaussian, as in the authors' released code. By standard deviations the score would be lower
+    by ``2 sum(log-scale)``, which favours small Gaussians. It is exact and includes the change of colour with the
+    viewing direction; values clamped at black or at the maximum of alpha have no gradient. The authors take the
+    picture at a quarter of its width; here the views' own size counts.
 
     Args:
         scene: N Gaussians.
@@ -91,21 +93,21 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 
 
 def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
-    """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: mean x, y, z, then the standard
-    deviations, per scene unit squared."""
+    """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: by the mean (world, scene units), then by the
+    log-scales."""
     _need_a_view(views)
     # In float32, small eigenvalues, and so the scores of Gaussians that few pixels show, are rounding errors. In a room
     # a quarter of the better half differed from float64.
     scene = scene.to(torch.float64)
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
     for index in _indices(views, progress):
-        means, stds = (value.detach().requires_grad_() for value in (scene.means, scene.stds))
+        means, scales = (value.detach().requires_grad_() for value in (scene.means, scene.scales))
         with torch.enable_grad():
-            projected = _project(means, stds, scene, views, index)
+            projected = _project(means, scales.exp(), scene, views, index)
             colors = sh_to_color(projected.directions, scene.sh.detach()[projected.ids], scene.sh_degree)
             in_plane = torch.cat([projected.opacities.log()[:, None], projected.means2d, projected.cov2d], dim=1)
-            shape = _jacobian(in_plane, means, stds, projected.ids)  # (M, 6, 6)
-            color = _jacobian(colors, means, stds, projected.ids)  # (M, 3, 6)
+            shape = _jacobian(in_plane, means, scales, projected.ids)  # (M, 6, 6)
+            color = _jacobian(colors, means, scales, projected.ids)  # (M, 3, 6)
         with torch.no_grad():
             sums = _second_moments(projected, colors.detach(), views).double()
             squares, cross, weight = sums[:, :36].view(-1, 6, 6), sums[:, 36:54].view(-1, 3, 6), sums[:, 54]
@@ -167,13 +169,13 @@ def _second_moments(projected: Projected, colors: Tensor, views: Views) -> Tenso
     return sum_over_pixels(projected, views.width, views.height, 55, values)
 
 
-def _jacobian(outputs: Tensor, means: Tensor, stds: Tensor, ids: Tensor) -> Tensor:
-    """Derivatives of (M, F) by the means and standard deviations of the same Gaussians, (M, F, 6) float64."""
+def _jacobian(outputs: Tensor, means: Tensor, scales: Tensor, ids: Tensor) -> Tensor:
+    """Derivatives of (M, F) by the means and log-scales of the same Gaussians, (M, F, 6) float64."""
     if not outputs.requires_grad:  # colours of SH degree 0 depend on neither
         return outputs.new_zeros(*outputs.shape, 6, dtype=torch.float64)
     rows = []
     for column in outputs.unbind(1):
-        grads = torch.autograd.grad(column.sum(), (means, stds), retain_graph=True, materialize_grads=True)
+        grads = torch.autograd.grad(column.sum(), (means, scales), retain_graph=True, materialize_grads=True)
         rows.append(torch.cat([grad[ids] for grad in grads], dim=1))
     return torch.stack(rows, dim=1).double()
 
