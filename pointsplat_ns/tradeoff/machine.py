@@ -6,12 +6,13 @@ import platform
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import cores
 
@@ -23,7 +24,7 @@ class MeasuringLock:
     name: str = "pointsplat-measuring.lock"
     """Name of its file in the folder for temporary files, or a path."""
     pause: float = 0.2
-    """Pause after a measurement in seconds, so that waiting processes, which poll every 0.05 s, can take the lock."""
+    """Pause after a measurement in seconds, so that waiting processes can take the lock."""
 
 
 LOCK = MeasuringLock()
@@ -50,22 +51,18 @@ def _processor() -> str:
 def one_at_a_time(progress: Progress) -> Iterator[bool]:
     """Hold the lock of measurements on this machine while the context is open; wait for others that hold it, which
     is reported to ``progress``. Yields whether the lock was taken: its file may belong to another user."""
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(Path(tempfile.gettempdir()) / LOCK.name, mode=0o666)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        progress("waiting for another measurement on this machine", 0.0)
-        lock.acquire()
-    except OSError:
-        yield False
-        return
-    try:
+    path = Path(tempfile.gettempdir()) / LOCK.name
+    with ExitStack() as stack:
+        try:
+            held = stack.enter_context(claim(path, mode=0o666))
+            if not held:
+                progress("waiting for another measurement on this machine", 0.0)
+                stack.enter_context(claim(path, wait=True, mode=0o666))
+        except OSError:
+            yield False
+            return
         yield True
-    finally:
-        lock.release()
-        time.sleep(LOCK.pause)
+    time.sleep(LOCK.pause)
 
 
 class OtherPrograms:
