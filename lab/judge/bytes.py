@@ -143,7 +143,7 @@ def main(
         scenes: PLY files that have a camera path of their name.
         megabytes: sizes of files. A scene whose PLY is smaller than four times a size is left out there.
         ways: what is measured, each a command and a format.
-        splat_transform: the program; by default npx searches it.
+        splat_transform: the program; by default the one on PATH.
         width: of the pictures, pixels.
         views: at most so many views of each scene, evenly spread.
         json_path: write all rows there, after each scene.

@@ -45,7 +45,7 @@ def tables(
         side: largest side of all images, pixels; photos are reduced.
         scoring_views: largest number of training poses for the scores of LightGaussian and PUP-3DGS.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
-        splat_transform: path of the program; by default npx searches it.
+        splat_transform: path of the program; by default the one on PATH.
         force: start over with the given scenes.
         json_output: print the content of tables.json, and nothing else on standard output.
     """

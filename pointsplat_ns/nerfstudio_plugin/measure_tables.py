@@ -63,7 +63,7 @@ def measure_tables(
         side: largest side of all images, pixels; photos are reduced.
         scoring_views: largest number of training poses that LightGaussian and PUP-3DGS score from.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
-        splat_transform: the program; by default the one that npx finds, if any.
+        splat_transform: the program; by default the one on PATH, if any.
         force: start over.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import connection
+from multiprocessing import connection, util
 from multiprocessing.process import BaseProcess
 from typing import Any, Generic, TypeVar
 
@@ -173,7 +173,8 @@ class _Worker(Generic[Item, Result]):
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         here, there = context.Pipe()
         process = context.Process(target=_serve, args=(function, threads, there), daemon=True)
-        with _environment(OMP_NUM_THREADS=str(threads)):  # for the server, of which processes inherit it
+        # The environment is for the server, of which processes inherit it.
+        with _environment(OMP_NUM_THREADS=str(threads)), _started_safely():
             if forks:
                 context.set_forkserver_preload([*preload])
             process.start()
@@ -238,3 +239,30 @@ def _environment(**variables: str) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+_STARTING = threading.Lock()
+
+
+@contextmanager
+def _started_safely() -> Iterator[None]:
+    """Keep the current folder off the path of Python's helpers while the context is open.
+
+    multiprocessing starts its server and its resource tracker with ``python -c``, which puts the current folder first
+    on the path: what lies beside the scenes would be imported in place of Python's own modules. Python 3.10 has no
+    option against it.
+    """
+
+    def start_safely(path: bytes, args: Sequence[str], passfds: Sequence[int]) -> int:
+        words = [*args]
+        at = words.index("-c") + 1
+        words[at] = f"import sys; sys.path = [*filter(None, sys.path)]; {words[at]}"  # sys is part of the interpreter
+        return start(path, words, passfds)
+
+    with _STARTING:
+        start: Any = util.spawnv_passfds  # type: ignore[attr-defined]
+        util.spawnv_passfds = start_safely  # type: ignore[attr-defined]
+        try:
+            yield
+        finally:
+            util.spawnv_passfds = start  # type: ignore[attr-defined]

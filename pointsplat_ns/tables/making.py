@@ -7,6 +7,7 @@ import functools
 import math
 import re
 import shlex
+import shutil
 import subprocess
 import tempfile
 import time
@@ -35,7 +36,7 @@ from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 
 
 class Tools:
-    """The tools of cells besides the package: weights, and splat-transform, which npx searches by default, when first
+    """The tools of cells besides the package: weights, and splat-transform, by default that on PATH, when first
     needed."""
 
     def __init__(self, options: TableOptions, refiners: Refiners, program: str | None = None):
@@ -240,11 +241,13 @@ class SplatTransform:
         modes: its modes of decimation: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
 
     Args:
-        program: the path of the program; by default ``npx --no-install splat-transform`` searches it.
+        program: the path of the program; by default the one of this name on PATH. npx would run one of the current
+            folder, which may be a stranger's.
     """
 
     def __init__(self, program: str | None = None):
-        self.command = [program] if program else ["npx", "--no-install", WAYS.splat_transform.name]
+        name = WAYS.splat_transform.name
+        self.command = [program or shutil.which(name) or name]
         self.version = self.missing = ""
         self.modes: tuple[Reducer, ...] = ()
         try:
@@ -259,7 +262,7 @@ class SplatTransform:
             self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
             return
         self.version = version[1]
-        label = f"{WAYS.splat_transform.name} {self.version}"
+        label = f"{name} {self.version}"
         if int(version[2]) < 3:
             self.modes = (self._mode(label, "--decimate"),)
         else:

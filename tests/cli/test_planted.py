@@ -1,0 +1,104 @@
+"""Files that a stranger put beside the scenes: no command imports, runs or obeys them."""
+
+import ast
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pointsplat_ns as ps
+from making import normal_scene
+from pointsplat_ns.tables.making import SplatTransform
+
+REPOSITORY = Path(__file__).parents[2]
+
+PLANTED = """import os
+with open({log!r}, "a") as log:
+    log.write(__name__ + "\\n")
+"""
+
+COMMANDS = (
+    "prune scenes -o pruned --keep 4 --by paper --jobs 2",
+    "compact scenes -o compacted --keep 4 --effort instant --jobs 2",
+    "convert scenes converted --to .spz --jobs 2",
+    "prune scenes/1.ply -o merged.ply --keep 4",  # compiles the kernels
+)
+"""Commands that start processes."""
+
+
+@pytest.fixture()
+def planted(tmp_path) -> Path:
+    """A folder of two scenes, and of modules and programs with all names that Python or a command might look for. Each
+    writes its name to the file ``../log``."""
+    folder, log = tmp_path / "stranger", str(tmp_path / "log")
+    for name in ("1", "2"):
+        ps.save(normal_scene(8), folder / "scenes" / f"{name}.ply")
+    modules = {"torch", "numpy", "scipy", "plyfile", "kornia", "tyro", "rich", "PIL", "yaml", "nerfstudio", "av"}
+    modules |= {"pointsplat_ns", "method_configs", "sitecustomize", "usercustomize", "safetensors", "psutil"}
+    for name in modules | sys.stdlib_module_names:
+        (folder / f"{name}.py").write_text(PLANTED.format(log=log))
+    programs = folder / "node_modules" / ".bin"
+    programs.mkdir(parents=True)
+    names = ("c++", "g++", "clang++", "cc1plus", "as", "ld", "git", "npx", "splat-transform", "ns-train", "ffmpeg")
+    for path in (place / name for place in (folder, programs) for name in names):
+        path.write_text(f"#!/bin/sh\necho program {path.name} >> {log}\nexit 1\n")
+        path.chmod(0o755)
+    return folder
+
+
+def pointsplat(folder: Path, words: str) -> subprocess.CompletedProcess[str]:
+    """Run the program as pip installs it: a script in a folder of its own."""
+    script = folder.parent / "bin" / "pointsplat"
+    script.parent.mkdir(exist_ok=True)
+    script.write_text(
+        f"#!{sys.executable}\nfrom pointsplat_ns.cli import program\nif __name__ == '__main__':\n    program()\n"
+    )
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "POINTSPLAT_CACHE": str(folder.parent / "cache")}
+    return subprocess.run(
+        [sys.executable, script, *words.split()], cwd=folder, env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_nothing_in_the_current_folder_is_imported_or_run(words, planted):
+    done = pointsplat(planted, words)
+    assert done.returncode == 0, done.stderr
+    log = planted.parent / "log"
+    assert not log.exists(), sorted(set(log.read_text().splitlines()))
+
+
+def test_splat_transform_of_the_current_folder_is_not_run(planted, monkeypatch):
+    """npx would run it."""
+    npx = planted.parent / "bin" / "npx"
+    npx.parent.mkdir()
+    npx.write_text("#!/bin/sh\nshift\nexec ./node_modules/.bin/$*\n")
+    npx.chmod(0o755)
+    monkeypatch.setenv("PATH", str(npx.parent))
+    monkeypatch.chdir(planted)
+    assert SplatTransform().missing and not (planted.parent / "log").exists()
+
+
+def test_each_place_that_starts_processes_is_known():
+    """Who adds one looks at what the current folder can do to it, and at ``COMMANDS`` above."""
+    starts = {"subprocess", "multiprocessing", "concurrent.futures.process", "pty", "asyncio"}
+    calls = {"system", "popen", "fork", "forkpty", "posix_spawn", "posix_spawnp", "execv", "execve", "execvp", "spawnv"}
+    found = set()
+    for path in sorted([*(REPOSITORY / "pointsplat_ns").rglob("*.py"), *(REPOSITORY / "method_configs").rglob("*.py")]):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            called = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "os"
+            if starts & {*names, *(name.partition(".")[0] for name in names)} or (called and node.attr in calls):
+                found.add(str(path.relative_to(REPOSITORY / "pointsplat_ns")))
+    assert found == {
+        "nerfstudio_plugin/running.py",  # ns-train and ns-eval, beside this Python
+        "system/kernels.py",  # a compiler on PATH
+        "system/programs.py",  # a program in an isolated Python
+        "system/workers.py",  # Python itself, without the current folder on its path
+        "tables/making.py",  # splat-transform on PATH
+        "tables/measuring.py",  # git, in the folder of the package
+    }
