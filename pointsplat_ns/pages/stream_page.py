@@ -14,14 +14,16 @@ from typing import Any
 
 import torch
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import smallest_turn
+from pointsplat_ns.io.files import open_inside
 from pointsplat_ns.io.formats import STREAM_META
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.pages.flight import FlightFrame, eyes_of
-from pointsplat_ns.pages.web_viewer import WebViewer, WebViewerPackage
+from pointsplat_ns.pages.web_viewer import WebViewer, WebViewerPackage, known_digests
 from pointsplat_ns.views import Views
 
 
@@ -72,6 +74,35 @@ def page_files(folder: Path) -> list[Path]:
     except OSError:
         return []
     return [file for file in files if file.is_file()] if ours else []
+
+
+_WORDS = {"pointsplat-ns", f"./{STREAM_META}", "still", "none", "step", "animTrack"}
+"""All texts among the values that a page of ours starts with."""
+
+
+def own_page(folder: Path) -> dict[str, bytes]:
+    """The files of the page in a folder, ``index.html`` first, if they are those that :func:`stream_page` makes of the
+    known viewer, or of the one that the environment names; else none. A stranger's folder may hold any script under
+    these names."""
+    package, files = WebViewerPackage(), {}
+    try:
+        for name in package.members.values():
+            with open_inside(folder, folder / name) as stream:
+                files[name] = stream.read(package.largest)
+        page = WebViewer(files)
+        ours = page.digests() == known_digests() and _is_plain(page.bootstrap())
+    except (OSError, ValueError, RecursionError, PointSplatError):
+        return {}
+    return files if ours else {}
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether values that a page starts with are such as :func:`stream_page` gives it: numbers, and known words."""
+    if isinstance(value, dict):
+        return all(map(_is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, (bool, int, float)) or value in _WORDS
 
 
 def _settings(frame: FlightFrame, turn: Similarity | None) -> dict[str, Any]:

@@ -73,6 +73,15 @@ class WebViewerPackage:
         return base64.b64encode(hashlib.sha512(data).digest()).decode("ascii") == self.integrity
 
 
+KNOWN_FILES: Mapping[str, str] = {
+    "index.html": "fdcc364d6b980db89dd8bc08d8376a8dedeb08656a544ab969b5384e609bc094",
+    "index.css": "92e50eab13d86bb6bd32ee62e0b60a42d25cd2047e49cc67d53d49e20d71c1da",
+    "index.js": "dc22b4a2c813747cb68f0bc43cc735eeb84ec458682e37358cc93f078d1d7fe7",
+    "LICENSE.supersplat-viewer.txt": "44716a2a1040df078772702d677d46f7d97f40c2375bf8221d4b3b741143f823",
+}
+"""SHA-256 of the viewer's files of this version, as :meth:`WebViewer.digests` has them."""
+
+
 @dataclass(frozen=True)
 class WebViewer:
     """The files of the viewer, by the names that they are written under."""
@@ -89,17 +98,30 @@ class WebViewer:
         """
         # Elements end at "</" and comments begin at "<!--", whatever surrounds them.
         values = json.dumps(bootstrap, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-        text = self.files["index.html"].decode("utf-8", "replace")
-        for element, content in (
-            ("title", html.escape(title)),
-            ('script type="application/json" id="sse-bootstrap"', values),
-        ):
+        return {**self.files, "index.html": self._filled(html.escape(title), values)[0]}
+
+    def _filled(self, title: str, values: str) -> tuple[bytes, str]:
+        """The page with another title and other values, as HTML, and the values that it had."""
+        text, before = self.files["index.html"].decode("utf-8", "replace"), ""
+        for element, content in (("title", title), ('script type="application/json" id="sse-bootstrap"', values)):
             name = element.partition(" ")[0]
-            found = list(re.finditer(f"<{element}>.*?</{name}>", text, flags=re.DOTALL))
+            found = list(re.finditer(f"<{element}>([^<]*)</{name}>", text))
             if len(found) != 1:
                 raise PointSplatError(f"the viewer's index.html has {len(found)} elements <{element}>; expected one")
+            before = found[0][1]
             text = f"{text[: found[0].start()]}<{element}>{content}</{name}>{text[found[0].end() :]}"
-        return {**self.files, "index.html": text.encode("utf-8", "replace")}
+        return text.encode("utf-8", "replace"), before
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each file, in 64 hexadecimal digits; of the page without its title and values. Raises
+        PointSplatError as :meth:`page`."""
+        files = {**self.files, "index.html": self._filled("", "")[0]}
+        return {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+
+    def bootstrap(self) -> Any:
+        """The values that the page starts with. Raises PointSplatError as :meth:`page`, and ValueError if they are no
+        JSON."""
+        return json.loads(self._filled("", "")[1])
 
 
 def web_viewer(package: WebViewerPackage | None = None) -> WebViewer:
@@ -127,6 +149,12 @@ def web_viewer(package: WebViewerPackage | None = None) -> WebViewer:
             with suppress(SceneError), replacing(cached, len(data)) as part:  # without room, the next call loads again
                 part.write_bytes(data)
     return _of_tarball(data, package)
+
+
+def known_digests() -> Mapping[str, str]:
+    """The digests of the viewer that pages are made of: the one that the environment variable names, else
+    :data:`KNOWN_FILES`. Raises PointSplatError as :func:`web_viewer`."""
+    return web_viewer().digests() if os.environ.get(WebViewerPackage().variable) else KNOWN_FILES
 
 
 def _downloaded(package: WebViewerPackage) -> bytes:

@@ -260,9 +260,10 @@ def _started_safely() -> Iterator[None]:
         return start(path, words, passfds)
 
     with _STARTING:
-        start: Any = util.spawnv_passfds  # type: ignore[attr-defined]
-        util.spawnv_passfds = start_safely  # type: ignore[attr-defined]
+        helpers: Any = util
+        start = helpers.spawnv_passfds
+        helpers.spawnv_passfds = start_safely
         try:
             yield
         finally:
-            util.spawnv_passfds = start  # type: ignore[attr-defined]
+            helpers.spawnv_passfds = start

@@ -1,16 +1,26 @@
-"""Serves the page beside a streamed SOG: the files that are there when it begins, and nothing else."""
+"""Serves a streamed SOG with the page beside it: the files that are there when it begins, and nothing else.
+
+The folder may be a stranger's. Its page and scripts are served only if they are those that this package writes; of the
+stream only regular files inside the folder.
+"""
 
 from __future__ import annotations
 
+import functools
+import logging
+from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import quote
 
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io.files import open_inside
 from pointsplat_ns.io.formats import STREAM_META
 from pointsplat_ns.io.formats.sog_stream import stream_parts
-from pointsplat_ns.pages.stream_page import page_files
+from pointsplat_ns.pages.stream_page import own_page, page_files
 from pointsplat_ns.viewing.server import Answer, Route, Served, Server
+
+logger = logging.getLogger("pointsplat_ns")
 
 
 class PageServer(Served):
@@ -20,12 +30,15 @@ class PageServer(Served):
     """
 
     def __init__(self, folder: Path, host: str, port: int):
-        page = page_files(folder)
+        page = own_page(folder)
         if not page:
             raise SceneError(f"{folder}: has no page; expected a folder that `pointsplat lod --stream --html` wrote")
-        routes = {"/": _route(page[0]), "/favicon.ico": Route(lambda _: Answer(status=HTTPStatus.NO_CONTENT))}
-        for file in (*page[1:], *stream_parts(folder / STREAM_META)):
-            routes["/" + quote(file.relative_to(folder).as_posix())] = _route(file)
+        routes = {"/favicon.ico": Route(lambda _: Answer(status=HTTPStatus.NO_CONTENT))}
+        for name, data in page.items():
+            routes["/" if name == "index.html" else f"/{name}"] = _route(name, Answer(data))
+        for file in stream_parts(folder / STREAM_META):
+            name = file.relative_to(folder).as_posix()
+            routes["/" + quote(name)] = _route(name, Answer(file=functools.partial(open_inside, folder, file)))
         self._server = Server(host, port, routes)
         self.url = self._server.url
 
@@ -42,20 +55,25 @@ class PageServer(Served):
 
 def is_stream_with_page(folder: Path) -> bool:
     """Whether a folder has a streamed SOG and the page that was written beside it."""
-    return (folder / STREAM_META).is_file() and bool(page_files(folder))
+    if not (folder / STREAM_META).is_file() or not page_files(folder):
+        return False
+    if own_page(folder):
+        return True
+    logger.warning("%s: its page is not the one that this version writes, so it is not served; the scene is", folder)
+    return False
 
 
-def _route(file: Path) -> Route:
-    """The route of a file, which is opened when it is asked for."""
+def _route(name: str, answer: Answer) -> Route:
+    """The route of a file. Where it is not in memory, it is opened when it is asked for."""
     text = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".txt": "text/plain"}
     other = {".json": "application/json", ".webp": "image/webp"}
-    kind = other.get(file.suffix, "application/octet-stream")
-    if file.suffix in text:
-        kind = f"{text[file.suffix]}; charset=utf-8"
-    headers = {}
-    if file.suffix == ".html":  # nothing comes from elsewhere, whatever the page's address asks for
-        headers["Content-Security-Policy"] = (
+    suffix = Path(name).suffix
+    kind = f"{text[suffix]}; charset=utf-8" if suffix in text else other.get(suffix, "application/octet-stream")
+    policy = "sandbox; default-src 'none'"  # data, should a browser open it as a page
+    if suffix == ".html":  # nothing comes from elsewhere, whatever the page's address asks for
+        policy = (
             "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
             "style-src 'self' 'unsafe-inline'; base-uri 'self'; form-action 'none'"
         )
-    return Route(lambda _: Answer(kind=kind, headers=headers, file=file))
+    filled = replace(answer, kind=kind, headers={"Content-Security-Policy": policy})
+    return Route(lambda _: filled)

@@ -47,8 +47,8 @@ class Answer:
     kind: str = "text/plain; charset=utf-8"
     status: http.HTTPStatus = http.HTTPStatus.OK
     headers: Mapping[str, str] = field(default_factory=dict)
-    file: Path | None = None
-    """A file that is sent in pieces, in place of the body."""
+    file: Callable[[], BinaryIO] | None = None
+    """Opens a file that is sent in pieces, in place of the body, or raises OSError."""
 
 
 @dataclass(frozen=True)
@@ -169,10 +169,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are not logged."""
 
     def _serve(self) -> None:
-        self.close_connection = True  # unless the whole body is read
+        last, self.close_connection = self.close_connection, True  # unless the whole body is read
         answer = self._answer()
+        self.close_connection |= last  # as the client asked
         try:
-            content = io.BytesIO(answer.body) if answer.file is None else answer.file.open("rb")
+            content = io.BytesIO(answer.body) if answer.file is None else answer.file()
         except OSError:
             answer, content = Answer(status=http.HTTPStatus.NOT_FOUND), io.BytesIO()
         with content:
@@ -196,7 +197,10 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
-        shutil.copyfileobj(content, self.wfile, 1 << 20)
+        while length > 0 and (piece := content.read(min(length, 1 << 20))):  # the file may have grown since
+            self.wfile.write(piece)
+            length -= len(piece)
+        self.close_connection |= length > 0
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)
