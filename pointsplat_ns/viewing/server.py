@@ -10,11 +10,13 @@ import io
 import shutil
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from pointsplat_ns.errors import PointSplatError, SceneError
@@ -66,11 +68,22 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
+    request_queue_size = 128
+    most_connections = 64
+    """Largest number of open connections, each of which has a thread: browsers have six for each page. If there are
+    more, the one that has waited longest for its client gives way."""
 
     def __init__(self, host: str, port: int, routes: Mapping[str, Route]):
         self.routes = routes
+        self._waiting: dict[socket.socket, float | None] = {}
+        """Open connections, and since when they wait for a request; None while one is answered."""
+        self._connecting = threading.Lock()
         self.hosts = (*LOCAL, host) if host in LOCAL else None
         """Accepted names of the server; None for any."""
+        with suppress(ImportError):
+            import resource  # not on Windows
+
+            self.most_connections = min(self.most_connections, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
         self.address_family, address = _free_address(host, port)
         super().__init__(address, _Handler)
         self.url = f"http://{_named(host)}:{self.server_port}"
@@ -88,6 +101,35 @@ class Server(ThreadingHTTPServer):
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a connection on a thread of its own, or close it where all others are being answered."""
+        with self._connecting:
+            if len(self._waiting) >= self.most_connections:
+                since = {connection: at for connection, at in self._waiting.items() if at is not None}
+                if since:
+                    longest = min(since, key=lambda connection: since[connection])
+                    del self._waiting[longest]
+                    with suppress(OSError):
+                        longest.shutdown(socket.SHUT_RDWR)  # its thread then ends
+            if room := len(self._waiting) < self.most_connections:
+                self._waiting[request] = time.monotonic()
+        if room:
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def waits(self, connection: socket.socket, for_client: bool) -> None:
+        """Note that a connection waits for its client from now on, or that it has a request to answer."""
+        with self._connecting:
+            if connection in self._waiting:
+                self._waiting[connection] = time.monotonic() if for_client else None
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._connecting:
+            self._waiting.pop(request, None)
+        super().shutdown_request(request)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a client that has gone."""
@@ -178,6 +220,7 @@ class _Handler(BaseHTTPRequestHandler):
             answer, content = Answer(status=http.HTTPStatus.NOT_FOUND), io.BytesIO()
         with content:
             self._send(answer, content)
+        cast(Server, self.server).waits(self.connection, True)
 
     def _send(self, answer: Answer, content: BinaryIO) -> None:
         length = content.seek(0, io.SEEK_END)
@@ -223,7 +266,7 @@ class _Handler(BaseHTTPRequestHandler):
         if int(length) > route.largest:
             text = f"{int(length):,} bytes; expected at most {route.largest:,}"
             return Answer(text.encode(), status=http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        body = _Body(self.rfile, int(length))
+        body = _Body(self.rfile, int(length), lambda: server.waits(self.connection, False))
         try:
             answer = route.answer(Request(options, int(length), cast(BinaryIO, body)))
         except (ValueError, TypeError, KeyError):  # a body that no page of this server sends
@@ -233,10 +276,12 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class _Body(io.RawIOBase):
-    """A body of known size, read from a connection."""
+    """A body of known size, read from a connection; ``whole`` is called when nothing of it is missing."""
 
-    def __init__(self, stream: io.BufferedIOBase, length: int):
-        self._stream, self.left = stream, length
+    def __init__(self, stream: io.BufferedIOBase, length: int, whole: Callable[[], object]):
+        self._stream, self.left, self._whole = stream, length, whole
+        if length == 0:
+            whole()
 
     def read(self, size: int = -1) -> bytes:
         """At most ``size`` bytes; empty at the end. Raises ValueError if the client sends less than it said."""
@@ -245,6 +290,8 @@ class _Body(io.RawIOBase):
         if len(data) < wanted:
             raise ValueError("the body is cut off")
         self.left -= len(data)
+        if data and self.left == 0:
+            self._whole()
         return data
 
 

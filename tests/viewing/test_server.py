@@ -93,6 +93,50 @@ def test_who_is_refused(method, headers, refused):
     assert refusal(method, headers, LOCAL) == refused
 
 
+def connected(viewer: Viewer, said: bytes) -> socket.socket:
+    """A connection over which a client has sent some bytes."""
+    host, _, port = viewer.url.removeprefix("http://").rpartition(":")
+    connection = socket.create_connection((host, int(port)), timeout=20)
+    connection.sendall(said)
+    return connection
+
+
+@pytest.mark.parametrize("request_line", ["GET / HTTP/1.1\r\nConnection: close", "GET / HTTP/1.0"])
+def test_a_connection_is_closed_as_its_client_asks(request_line, viewer):
+    host = viewer.url.removeprefix("http://")
+    with connected(viewer, f"{request_line}\r\nHost: {host}\r\n\r\n".encode()) as connection:
+        with connection.makefile("rb") as stream:
+            assert b"<html" in stream.read()  # ends when the server closes, not after 20 s without a byte
+
+
+@pytest.mark.parametrize(
+    "said", ["", "GET / HT", "POST /look HTTP/1.1\r\nOrigin: {0}\r\nHost: {1}\r\nContent-Length: 9"]
+)
+def test_clients_that_send_half_a_request_stop_nobody(said, empty, monkeypatch):
+    """Nor one whose request is being answered meanwhile, here for as long as we want."""
+    answering, go_on = threading.Event(), threading.Event()
+    empty._server.most_connections = 8
+    empty._server.routes["/slow"] = server.Route(
+        lambda _: (answering.set(), go_on.wait(20), server.Answer(b"done"))[-1]
+    )
+    half = said.format(empty.url, empty.url.removeprefix("http://")) + ("\r\n\r\n1234" if "POST" in said else "")
+    got: list[bytes] = []
+    slow = threading.Thread(target=lambda: got.append(answer(empty, "GET", "/slow")[1]))
+    slow.start()
+    assert answering.wait(20)
+    held = [connected(empty, half.encode()) for _ in range(66)]
+    assert answer(empty, "GET", "/")[0] == 200
+    assert (
+        sum(thread.name.startswith("Thread-") and "process_request" in thread.name for thread in threading.enumerate())
+        <= 9
+    )
+    go_on.set()
+    slow.join()
+    assert got == [b"done"]
+    for connection in held:
+        connection.close()
+
+
 def test_pages_elsewhere_move_no_camera_and_drop_no_scene(viewer, empty):
     for opened, path in ((viewer, "/look"), (viewer, "/picture"), (empty, "/drop?name=a.ply")):
         for origin in ({"Origin": "http://evil.example"}, {}):
