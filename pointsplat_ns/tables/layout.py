@@ -15,6 +15,9 @@ from pointsplat_ns.tradeoff.points import ImageMetrics
 NO_FIGURE = "-"
 """Text of an empty cell."""
 
+OTHER_SCENES = "†"
+"""Mark of a row whose means are over other scenes than those of the table."""
+
 Row = tuple[str, ...]
 
 
@@ -54,23 +57,24 @@ class Layout:
         header = ("kept", "method", "Gaussians", "frames a second", "MB", "scenes")
         ways = WAYS.table_2
         blocks = [[(WAYS.dense, 1.0)], *([(way, share) for way in ways] for share in self.shares)]
+        cells = [pair for block in blocks for pair in block]
+        over = self._shared(cells)
         sections = []
         for block in blocks:
             rows = []
             for way, share in block:
-                mean = self.group.mean(way.name, share)
+                mean = self.group.mean(way.name, share, over)
                 figures: Row = ("not measured", NO_FIGURE, NO_FIGURE, NO_FIGURE)
                 if mean is not None:
                     figures = (
                         f"{mean.gaussians:,.0f}",
                         _fps(mean.fps),
                         three_digits(mean.megabytes),
-                        self._scenes(mean),
+                        _scenes(mean),
                     )
                 rows.append((_percent(share), way.label, *figures))
             sections.append(tuple(rows))
-        notes = self._reasons([pair for block in blocks for pair in block])
-        return Table(2, self._title("Efficiency"), header, tuple(sections), notes)
+        return Table(2, self._title("Efficiency", over), header, tuple(sections), self._notes(cells, over))
 
     def _table_3(self) -> Table:
         rows = [((f"{weight:g}", way.label), way, PROTOCOL.ablation_share) for weight, way in WAYS.table_3]
@@ -92,6 +96,7 @@ class Layout:
     ) -> Table:
         """A table of PSNR, SSIM and LPIPS, with the paper's figures where the dataset is the same."""
         cells = [(way, share) for section in sections for _, way, share in section]
+        over = self._shared(cells)
         dataset = self.group.dataset
         with_paper = any(published(number, dataset, way.name, share) for way, share in cells)
         metrics = ("PSNR", "SSIM", "LPIPS")
@@ -102,24 +107,45 @@ class Layout:
         header += tuple(f"{name} (paper)" for name in metrics) if with_paper else ()
 
         def row(words: Row, way: Way, share: float) -> Row:
-            mean = self.group.mean(way.name, share)
+            mean = self.group.mean(way.name, share, over)
             if mean is None:
                 figures: Row = ("not measured",) + (NO_FIGURE,) * (7 if self.group.has_photos else 4)
             else:
                 figures = _quality(mean.photos) if self.group.has_photos else ()
-                figures += (*_quality(mean.renders), _worst(mean), self._scenes(mean))
+                figures += (*_quality(mean.renders), _worst(mean), _scenes(mean))
             theirs = _quality(published(number, dataset, way.name, share)) if with_paper else ()
             return (*words, *figures, *theirs)
 
         rows = tuple(tuple(row(*entry) for entry in section) for section in sections)
-        return Table(number, self._title(title), header, rows, self._reasons(cells))
+        return Table(number, self._title(title, over), header, rows, self._notes(cells, over))
 
-    def _title(self, what: str) -> str:
-        return f"{what}: {self.group.name}, {_scenes_text(len(self.group.scenes))}"
+    def _title(self, what: str, over: frozenset[str]) -> str:
+        return f"{what}: {self.group.name}, {_scenes_text(len(over))}"
 
-    def _scenes(self, mean: Mean) -> str:
-        count = len(self.group.scenes)
-        return f"{count}" if mean.scenes == count else f"{mean.scenes} of {count}"
+    def _shared(self, cells: Sequence[tuple[Way, float]]) -> frozenset[str]:
+        return self.group.shared((way.name, share) for way, share in cells)
+
+    def _notes(self, cells: Sequence[tuple[Way, float]], over: frozenset[str]) -> tuple[str, ...]:
+        """Lines below a table: rows of other scenes, the networks and steps of rows, and reasons for empty rows."""
+        means = [self.group.mean(way.name, share, over) for way, share in cells]
+        notes = []
+        if any(mean is not None and not mean.comparable for mean in means):
+            notes.append(
+                f"{OTHER_SCENES}: not over the scenes of the other rows ({', '.join(sorted(over))}); its means do not "
+                "compare with theirs"
+            )
+        return (*notes, *self._tools(cells), *self._reasons(cells))
+
+    def _tools(self, cells: Sequence[tuple[Way, float]]) -> list[str]:
+        """The networks, and the steps of fine-tuning, that rows were made with."""
+        rows: dict[str, list[str]] = {}
+        for way, share in cells:
+            for scene in self.group.scenes:
+                cell = scene.cells.get((way.name, share))
+                if cell is not None and cell.made_with and (way.network is not None or way.fine_tuned):
+                    row, labels = f"{way.label} ({_percent(share)})", rows.setdefault(cell.made_with, [])
+                    labels += [] if row in labels else [row]
+        return [f"{', '.join(labels)}: {made_with}" for made_with, labels in rows.items()]
 
     def _reasons(self, cells: Sequence[tuple[Way, float]]) -> tuple[str, ...]:
         """Reasons for empty rows and missing scenes, each once."""
@@ -149,6 +175,10 @@ def figure_medians(group: Group, medians: Mapping[str, tuple[float, float]]) -> 
     )
     title = f"Medians of Figure 4: {group.name}, {_percent(PROTOCOL.figure_share)} kept"
     return Table(0, title, ("method", "opacity", "log10 of the volume"), (rows,))
+
+
+def _scenes(mean: Mean) -> str:
+    return f"{mean.scenes}" if mean.comparable else f"{mean.scenes} {OTHER_SCENES}"
 
 
 def _scenes_text(count: int) -> str:
@@ -196,7 +226,12 @@ def latex_text(text: str) -> str:
         >>> print(latex_text("50 % of room_1"))
         50 \\% of room\\_1
     """
-    escaped = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    escaped = {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        OTHER_SCENES: r"\textdagger{}",
+    }
     escaped |= {character: f"\\{character}" for character in "&%$#_{}"}
     return "".join(escaped.get(character, character) for character in " ".join(text.split()))
 

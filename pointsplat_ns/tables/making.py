@@ -153,6 +153,10 @@ class Weights:
     refiner: TrainedRefiner
     trained_on: frozenset[str]
     """Names of training scenes; empty if they are not known."""
+    keeps: tuple[float, ...]
+    """Budgets of the training: shares, or counts above 1."""
+    training: str
+    """How the network was trained, as far as its file says: steps, loss, rates, supervision."""
 
     @cached_property
     def digest(self) -> str:
@@ -171,7 +175,13 @@ class Weights:
     @property
     def text(self) -> str:
         """One line that identifies the weights."""
-        return f"weights {self.digest} ({self.network}, keep {self.refiner.settings.keep:g})"
+        parameters = sum(parameter.numel() for parameter in self.refiner.network.parameters())
+        keeps = ", ".join(f"{keep:g}" for keep in self.keeps)
+        norm = self.refiner.network.config.norm
+        words = [f"{parameters:,} parameters", f"norm by {norm}", f"{self.network}, keep {keeps}"]
+        words += [self.training] if self.training else []
+        words += [f"{len(self.trained_on)} scenes"] if self.trained_on else []
+        return f"weights {self.digest} ({'; '.join(words)})"
 
 
 class Refiners:
@@ -182,27 +192,38 @@ class Refiners:
 
     def find(self, network: Network, share: float, scene: str) -> tuple[Weights | None, str]:
         """The weights for a row (the needed network, a share of the Gaussians, the name of a scene), or the reason for
-        none. Of several, those with the training budget nearest to ``share`` are taken, by ratio. Weights trained on
-        the scene itself are excluded."""
-        fitting = [weights for weights in self.all if weights.network == network]
-        unseen = [weights for weights in fitting if scene not in weights.trained_on]
-        if unseen:
-            return min(unseen, key=lambda weights: _distance(weights.refiner.settings.keep, share)), ""
+        none. They were trained for this network and this share, and not on the scene itself. Of several, the first is
+        taken."""
+        fitting = [
+            weights
+            for weights in self.all
+            if weights.network == network and any(math.isclose(keep, share, rel_tol=1e-3) for keep in weights.keeps)
+        ]
+        for weights in fitting:
+            if scene not in weights.trained_on:
+                return weights, ""
         if fitting:
             return None, f"its weights ({fitting[0].path}) were trained on this scene"
-        return None, f"no weights were given (--refiners) of a {network}"
-
-
-def _distance(keep: float | int, share: float) -> float:
-    """Distance of a training budget from a share; infinite for budgets in Gaussians."""
-    return abs(math.log(keep / share)) if keep <= 1 else math.inf
+        missing = f"no weights were given (--refiners) of a {network}, to {100 * share:g} %"
+        return None, f"{missing}; to train them: {network.command(share)}"
 
 
 def _read(path: Path) -> Weights:
     inside = path / "refiner.safetensors"  # of a finished training; a checkpoint does not name its training scenes
     file = inside if path.is_dir() and inside.is_file() else path
     metadata = read_metadata(file) if file.suffix.lower() == ".safetensors" else {}
-    return Weights(path, load_refiner(file), _names(metadata.get("scenes")))
+    refiner = load_refiner(file)
+    more = metadata.get("more_keeps")
+    more = [keep for keep in more if isinstance(keep, (int, float))] if isinstance(more, list) else []
+    known = {name: metadata[name] for name in TRAINING_SETTINGS if isinstance(metadata.get(name), (str, int, float))}
+    training = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
+    return Weights(path, refiner, _names(metadata.get("scenes")), (refiner.settings.keep, *more), training)
+
+
+TRAINING_SETTINGS = (
+    "size", "steps", "supervision", "pixel_loss", "lpips_weight", "lpips_net", "rates", "rate_factor", "schedule",
+)  # fmt: skip
+"""Entries of a refiner's metadata that a row of a table names."""
 
 
 def _names(scenes: Any) -> frozenset[str]:

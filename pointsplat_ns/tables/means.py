@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -33,7 +34,7 @@ class SceneCells:
 
 @dataclass(frozen=True)
 class Mean:
-    """A row of a table: means over the scenes with this cell."""
+    """A row of a table: means over the scenes of the table, or over those that have the row's cell."""
 
     photos: ImageMetrics | None
     """None unless all scenes have held-out photos."""
@@ -44,6 +45,8 @@ class Mean:
     """Frames a second; None if other programs kept the machine busy during the timing."""
     scenes: int
     """Number of scenes in the mean."""
+    comparable: bool
+    """Whether these are the scenes of the table. If not, the row does not compare with others."""
     worst: str
     """Name of the scene with the largest loss."""
     worst_psnr: float
@@ -70,11 +73,24 @@ class Group:
         """Whether some cells were compared with photos."""
         return any(cell.point.against_photos is not None for scene in self.scenes for cell in scene.cells.values())
 
-    def mean(self, way: str, share: float) -> Mean | None:
-        """The mean of a cell over the scenes with it; None if no scene has it."""
+    def shared(self, cells: Iterable[tuple[str, float]]) -> frozenset[str]:
+        """Names of the scenes over which a table of these cells (way, share) takes its means: the set of scenes that
+        most cells have; of several such sets, the largest. Means over different scenes do not compare."""
+        found = Counter(
+            frozenset(scene.about.name for scene in self.scenes if cell in scene.cells) for cell in dict.fromkeys(cells)
+        )
+        del found[frozenset()]
+        return max(found, key=lambda names: (found[names], len(names), sorted(names)), default=frozenset())
+
+    def mean(self, way: str, share: float, over: frozenset[str]) -> Mean | None:
+        """The mean of a cell over the scenes of a table (:meth:`shared`). If one of these lacks the cell, the mean is
+        over all scenes that have it, and not comparable; None if no scene has it."""
         found = [(scene, scene.cells[way, share].point) for scene in self.scenes if (way, share) in scene.cells]
         if not found:
             return None
+        comparable = over <= {scene.about.name for scene, _ in found}
+        if comparable:
+            found = [(scene, point) for scene, point in found if scene.about.name in over]
         points = [point for _, point in found]
         photos = [point.against_photos for point in points if point.against_photos is not None]
         worst, point = max(found, key=lambda pair: _badness(*pair))
@@ -85,6 +101,7 @@ class Group:
             megabytes=fmean(point.bytes / 1e6 for point in points),
             fps=None if any(map(_disturbed, points)) else fmean(1000 / point.frame_ms for point in points),
             scenes=len(points),
+            comparable=comparable,
             worst=worst.about.name,
             worst_psnr=(point.against_photos or point.against_dense).psnr,
             worst_loss=worst.loss(point),

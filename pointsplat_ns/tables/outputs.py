@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 READING = (
-    "Figures are means over scenes. PSNR (dB), SSIM and LPIPS (AlexNet) are against held-out photos; those of "
-    '"renders" against the dense scene\'s own renders in the same poses. "Loses most" names the scene that loses most '
-    "PSNR compared to its dense scene, with its PSNR and the difference; among dense scenes it is the one of the least "
-    "PSNR. \\*: nothing is fine-tuned or refined."
+    "Figures are means over the same scenes in all rows of a table, but for rows with a mark. PSNR (dB), SSIM and "
+    'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s own renders in the '
+    'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, with its PSNR and the '
+    "difference; among dense scenes it is the one of the least PSNR. \\*: nothing is fine-tuned or refined."
 )
 
 
@@ -126,11 +126,17 @@ def medians(group: Group) -> dict[str, tuple[float, float]]:
 
 
 def densities(group: Group, way: str, share: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Shares of the Gaussians in each bin of opacity and of volume, means over scenes; None if there are none."""
+    """Shares of the Gaussians in each bin of opacity and of volume, means over the scenes that the ways of Figure 4
+    share; None if one of them lacks this way."""
     opacities, volumes = [], []
+    over = group.shared((shown.name, kept) for shown, kept in WAYS.figure_4)
     for scene in group.scenes:
+        if scene.about.name not in over:
+            continue
         cell = scene.cells.get((way, share))
-        if cell is not None and cell.opacities and cell.volumes and sum(cell.opacities) and sum(cell.volumes):
+        if cell is None:
+            return None
+        if cell.opacities and cell.volumes and sum(cell.opacities) and sum(cell.volumes):
             opacities.append(np.array(cell.opacities) / sum(cell.opacities))
             volumes.append(np.array(cell.volumes) / sum(cell.volumes))
     return (np.mean(opacities, axis=0), np.mean(volumes, axis=0)) if opacities else None

@@ -55,6 +55,21 @@ class Network:
         weight = "" if self.opacity_weight is None else f", lambda {self.opacity_weight:g}"
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
+    def command(self, share: float) -> str:
+        """The command that trains such a network for a share of the Gaussians, on scenes of the user's choice.
+
+        Example:
+            >>> Network("concat", "random", None).command(0.3)
+            'ns-train pointsplat --data SCENES --pipeline.model.encoder concat --pipeline.model.by random \
+--pipeline.model.keep 0.3'
+        """
+        options = {"encoder": self.encoder, "by": self.by, "keep": f"{share:g}"}
+        options |= {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
+        options |= {} if self.use_appearance else {"use-appearance": "False"}
+        options |= {} if self.use_position else {"use-position": "False"}
+        words = " ".join(f"--pipeline.model.{name} {value}" for name, value in options.items())
+        return f"ns-train pointsplat --data SCENES {words}"
+
 
 @dataclass(frozen=True)
 class Way:

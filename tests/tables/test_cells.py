@@ -94,14 +94,34 @@ def test_means_are_over_scenes_and_name_the_one_that_loses_most(tmp_path):
     write_scene(tmp_path, "kitchen", worse=2.0)
     write_scene(tmp_path, "a_room", group="rooms", photos=False)
     scenes, rooms = sorted(read_groups(tmp_path), key=lambda group: -len(group.scenes))
-    mean, parts = scenes.mean("merge", 0.1), [scene.cells["merge", 0.1].point for scene in scenes.scenes]
+    over = scenes.shared([("merge", 0.1)])
+    mean, parts = scenes.mean("merge", 0.1, over), [scene.cells["merge", 0.1].point for scene in scenes.scenes]
     assert mean.scenes == 2 and mean.worst == "kitchen" and mean.worst_psnr == parts[1].against_photos.psnr
     assert mean.worst_loss == pytest.approx(30 - parts[1].against_photos.psnr)
     assert mean.photos.psnr == pytest.approx(sum(part.against_photos.psnr for part in parts) / 2)
     assert mean.fps == pytest.approx(1000.0) and mean.gaussians == 100 and mean.megabytes == pytest.approx(0.0248)
-    alone = rooms.mean("merge", 0.1)
+    alone = rooms.mean("merge", 0.1, frozenset({"a_room"}))
     assert alone.photos is None and alone.worst_loss is None and alone.worst == "a_room"
-    assert scenes.mean("merge", 0.77) is None
+    assert scenes.mean("merge", 0.77, over) is None
+
+
+def test_a_table_takes_its_means_over_the_same_scenes(tmp_path):
+    """A dense scene more changes no row, and a row that lacks a scene is marked."""
+    every = {way.name for way, _ in WAYS.cells((0.3, 0.1))}
+    write_scene(tmp_path, "fox")
+    write_scene(tmp_path, "kitchen", worse=2.0, without=("pointsplat",))
+    write_scene(tmp_path, "attic", worse=9.0, without=(*(every - {"dense"}),))
+    [group] = read_groups(tmp_path)
+    one, two, _, four = Layout(group, (0.3,), {}).tables()
+    assert one.title.endswith("2 scenes") and rows_of(one)["100 %", "3DGS (dense)"][-1] == "2"
+    both = [
+        scene.cells["paper", 0.1].point.against_photos.psnr for scene in group.scenes if scene.about.name != "attic"
+    ]
+    assert rows_of(one)["10 %", "PointSplat*"][0] == f"{sum(both) / 2:.2f}"
+    assert rows_of(one)["10 %", "PointSplat"][-1] == rows_of(two)["10 %", "PointSplat"][-1] == "1 †"
+    assert any("not over the scenes of the other rows (fox, kitchen)" in note for note in one.notes)
+    assert [row[-1] for row in four.sections[0]] == ["2", "2", "2", "2", "1 †"]
+    assert latex_table(one).count(r" & 1 \textdagger{} \\") == 2
 
 
 def test_frames_that_were_timed_on_a_busy_machine_do_not_count(tmp_path):
@@ -110,14 +130,16 @@ def test_frames_that_were_timed_on_a_busy_machine_do_not_count(tmp_path):
     for changes in ({"others_cores": 100.0}, {"frame_ms": 0.0}):
         journal.add(replace(one, point=replace(one.point, **changes)), journal.about, IDENTITY)
         [group] = read_groups(tmp_path)
-        assert group.mean("merge", 0.1).fps is None and group.mean("paper", 0.1).fps == pytest.approx(1000)
+        over = frozenset({"fox"})
+        assert group.mean("merge", 0.1, over).fps is None and group.mean("paper", 0.1, over).fps == pytest.approx(1000)
 
 
 def test_a_mean_of_photos_needs_photos_of_all_scenes(tmp_path):
     write_scene(tmp_path, "fox")
     write_scene(tmp_path, "splat", photos=False)
     [group] = read_groups(tmp_path)
-    assert group.mean("merge", 0.1).photos is None and group.mean("merge", 0.1).renders is not None
+    mean = group.mean("merge", 0.1, frozenset({"fox", "splat"}))
+    assert mean.photos is None and mean.renders is not None
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def all_weights(weights):
     return [
         weights(
             f"{network.encoder}-{network.by}-{network.opacity_weight}-{network.use_appearance:d}{network.use_position:d}",
-            {"by": network.by, "keep": 0.1, "opacity_weight": network.opacity_weight},
+            {"by": network.by, "keep": 0.1, "more_keeps": [0.3], "opacity_weight": network.opacity_weight, "steps": 24},
             encoder=network.encoder,
             use_appearance=network.use_appearance,
             use_position=network.use_position,
@@ -52,8 +52,11 @@ def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer
     assert cells["splat-transform", 0.3].made_with == "splat-transform 3.7.0 -d"
     assert cells["pup-tuned", 0.3].made_with == "2 steps"
     assert cells["pointsplat", 0.3].made_with.endswith(
-        "(dual encoder, trained on scenes pruned by paper, lambda 0.3, keep 0.1)"
+        "(664,563 parameters; norm by scene; dual encoder, trained on scenes pruned by paper, lambda 0.3, "
+        "keep 0.1, 0.3; steps 24)"
     )
+    page = (tmp_path / "tables" / "tables.md").read_text()
+    assert "PointSplat (30 %): weights" in page and "PUP-3DGS (30 %)" in page
     assert "--refiners" in cells["pointsplat", 0.3].point.command and "--fine-tune 2" in cells["pup", 0.3].point.command
     content = json.loads((tmp_path / "tables" / "tables.json").read_text())
     assert len(content["cells"]) == len(cells) and content["not_measured"] == {} and content["paper"] == {}
@@ -83,6 +86,18 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
     assert said["room/splat-transform/30%"] == "splat-transform cannot be run (/no/such/program: FileNotFoundError)"
     rows = [line for line in (tmp_path / "tables" / "tables.md").read_text().splitlines() if "| PointSplat |" in line]
     assert rows and all("| not measured | - |" in line for line in rows)
+
+
+@pytest.mark.parametrize("trained", [{"keep": 0.1}, {"keep": 20_000}, {"keep": 0.1, "more_keeps": [0.2]}])
+def test_weights_of_another_budget_fill_no_row(measured, weights, tmp_path, trained):
+    other = weights("budget", {"by": "paper", **trained})
+    [group] = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
+    assert [*cells_of(group)] == [("paper", 0.3)]
+    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]["room/pointsplat/30%"]
+    assert said.endswith(
+        "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual --pipeline.model.by paper "
+        "--pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
+    )
 
 
 def test_weights_that_know_the_scene_do_not_test_it(measured, weights, tmp_path):

@@ -29,7 +29,7 @@ from pointsplat_ns.nerfstudio_plugin.running import (
     train_refiner_command,
     train_scene_command,
 )
-from pointsplat_ns.refiner import read_refiner, save_refiner
+from pointsplat_ns.refiner import read_metadata, read_refiner, save_refiner
 from pointsplat_ns.rooms import write_room
 
 
@@ -129,7 +129,7 @@ def make_refiner(
     }
     target = Path(weights or output)
     refiner = read_refiner(trained / RUN_FILES.refiner)
-    save_refiner(refiner, target / RUN_FILES.refiner, about)
+    save_refiner(refiner, target / RUN_FILES.refiner, {**read_metadata(trained / RUN_FILES.refiner), **about})
     command = refiner_command(Path("scenes"), Path("refiners"), name, RECIPE.timestamp, size, steps, seed)
     with replacing(target / "CARD.md") as part:
         parameters = sum(p.numel() for p in refiner.parameters())

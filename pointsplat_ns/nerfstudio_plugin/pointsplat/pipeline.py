@@ -31,6 +31,14 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingSt
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
+MODEL_METADATA = (
+    "size", "by", "keep", "more_keeps", "opacity_weight", "norm", "pixel_loss", "lpips_weight", "lpips_net",
+)  # fmt: skip
+"""Settings of the model in the metadata of a saved network."""
+
+TRAINER_METADATA = ("rates", "rate_factor", "schedule")
+"""Settings of the trainer in the metadata of a saved network."""
+
 
 @dataclass
 class PointSplatPipelineConfig(VanillaPipelineConfig):
@@ -205,11 +213,11 @@ class PointSplatPipeline(VanillaPipeline):
                     self.model.refiner,
                     trainer.base_dir / RUN_FILES.refiner,
                     {
-                        "step": str(step),
+                        "steps": step + 1,
                         "scenes": ", ".join(names),
-                        "keep": str(self.config.model.keep),
-                        "by": self.config.model.by,
-                        "opacity_weight": self.config.model.opacity_weight,
+                        "supervision": self.datamanager.supervision,
+                        **{name: getattr(self.config.model, name) for name in MODEL_METADATA},
+                        **{name: getattr(trainer.config, name) for name in TRAINER_METADATA},
                     },
                 )
 

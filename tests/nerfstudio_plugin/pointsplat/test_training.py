@@ -12,6 +12,7 @@ from making import dense_config, equal, pipeline_of
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
 
@@ -52,8 +53,11 @@ def test_the_network_is_saved_by_itself_at_the_end(trained):
     loaded = read_refiner(path).state_dict()
     expected = trainer.pipeline.model.refiner.state_dict()
     assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
-    about = {"step": "9", "scenes": "wall-a", "keep": "0.5", "by": "paper", "opacity_weight": None}
-    assert read_metadata(path) == about
+    about = read_metadata(path)
+    model = {name: getattr(config.pipeline.model, name) for name in MODEL_METADATA}
+    assert {name: about[name] for name in model} == {**model, "more_keeps": list(model["more_keeps"])}
+    assert (about["steps"], about["scenes"], about["keep"], about["by"]) == (10, "wall-a", 0.5, "paper")
+    assert (about["supervision"], about["rates"], about["rate_factor"]) == ("photos", "fast", config.rate_factor)
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
 
