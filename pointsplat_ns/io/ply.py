@@ -20,6 +20,14 @@ import torch
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
+from pointsplat_ns.io.ply_dialects import (
+    COLORS,
+    FILTER,
+    dc_of_colors,
+    fuse_filter,
+    has_plain_colors,
+    with_plain_names,
+)
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.system.pieces import CHUNK
 
@@ -41,9 +49,11 @@ def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
-    Gaussians, which have no ``scale_2``, become flat ones. Other properties and elements, and bytes after the last
-    element, are not read; a warning says so. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are
-    dropped, and their number is logged; all-zero rows are kept (a zero quaternion is the identity).
+    Gaussians, which have no ``scale_2``, become flat ones. Names with CloudCompare's prefixes, colours as red, green
+    and blue, and Mip-Splatting's 3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties
+    and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be drawn
+    (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
+    quaternion is the identity).
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -61,7 +71,7 @@ def read_ply(path: Path | str) -> Gaussians:
         else:
             with _GaussiansAlone(path, header) as stream:
                 rows = PlyData.read(stream)["vertex"].data
-            scene = _scene(len(rows), lambda these: rows[these], k, in_file, traits_of(header, path))
+            scene = _scene(len(rows), lambda these: rows[these], k, in_file, _traits(header, vertex, path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -105,7 +115,7 @@ class PlyRows:
         """The rows of a file with what :func:`_checked` found in it."""
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        return cls(path, vertex.count, min(in_file, MAX_REST), traits_of(header, path), dtype, start, in_file)
+        return cls(path, vertex.count, min(in_file, MAX_REST), _traits(header, vertex, path), dtype, start, in_file)
 
     def __len__(self) -> int:
         return self.count
@@ -160,11 +170,17 @@ def _checked(path: Path) -> tuple[Header, Element, int]:
     is not a 3DGS PLY, or cannot be read."""
     try:
         with path.open("rb") as stream:
-            header = read_header(stream, path)
+            header = with_plain_names(read_header(stream, path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     vertex = _gaussian_element(header, path)
     return header, vertex, _num_rest(vertex, path)
+
+
+def _traits(header: Header, vertex: Element, path: Path) -> Traits:
+    """The traits of a scene; one with Mip-Splatting's 3D filter was trained with antialiasing."""
+    traits = traits_of(header, path)
+    return traits._replace(antialiased=traits.antialiased or FILTER in {name for name, _ in vertex.properties})
 
 
 def write_ply(scene: Gaussians, path: Path | str) -> None:
@@ -258,7 +274,13 @@ def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) ->
     """Warn of what a file holds beside the Gaussians that are read."""
     if in_file > MAX_REST:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-    known = {name for names in _COLUMNS.values() for name in names}
+    known = {name for names in _COLUMNS.values() for name in names} | {FILTER}
+    present = {name for name, _ in vertex.properties}
+    if has_plain_colors(present):
+        known |= {*COLORS}
+        logger.info("%s: colours are those of 'red', 'green' and 'blue'", path)
+    if FILTER in present:
+        logger.info("%s: Mip-Splatting's 3D filter is put into sizes and opacities", path)
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
     unread += [f"the element {element.name!r}" for element in header.elements if element != vertex and element.count]
@@ -285,6 +307,8 @@ def _num_rest(vertex: Element, path: Path) -> int:
     if _is_flat(present):
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")
+    if has_plain_colors(present):
+        present |= {*_COLUMNS["features_dc"]}
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
     required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
@@ -305,11 +329,15 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
     channel beyond the constant one, of ``in_file`` that the file has."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
-    flat = _is_flat(rows_of(slice(0, 0)).dtype.names or ())
+    kinds = rows_of(slice(0, 0)).dtype
+    names = kinds.names or ()
+    flat, plain_colors = _is_flat(names), has_plain_colors(names)
     columns = {
         **{name: _COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
         # Channel-major in the file, channel last in a scene.
         "scales": _COLUMNS["scales"][: 2 if flat else 3],
+        "features_dc": COLORS if plain_colors else _COLUMNS["features_dc"],
+        FILTER: [FILTER] if FILTER in names else [],
         "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
     }
     tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
@@ -322,6 +350,11 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
             for name, fields in columns.items():
                 if fields:
                     tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
+    filters = tables.pop(FILTER)
+    if filters.shape[1]:
+        tables["scales"], tables["opacities"] = fuse_filter(tables["scales"], tables["opacities"], filters)
+    if plain_colors:
+        tables["features_dc"] = dc_of_colors(tables["features_dc"], kinds["red"])
     if flat:
         tables["scales"] = np.column_stack([tables["scales"], np.full(count, -np.inf, np.float32)])
     tensors = {name: torch.from_numpy(table) for name, table in tables.items()}

@@ -1,0 +1,78 @@
+"""3DGS PLYs as other programs write them: names with prefixes, colours as red, green and blue, and 3D filters.
+
+CloudCompare puts ``scalar_`` (or ``scal_``, or both) before the name of each property that it does not know. ns-export
+writes colours as bytes if asked to. Mip-Splatting keeps the size of its 3D filter beside the sizes that it was trained
+with; the filter belongs to the scene, and its own ``create_fused_ply.py`` fuses both.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.io.ply_header import Header
+
+COLORS = ["red", "green", "blue"]
+FILTER = "filter_3D"
+
+_PREFIXED = re.compile(r"(?:scalar_)?(?:scal_)?(f_dc_\d|f_rest_\d+|opacity|scale_\d|rot_\d|filter_3D)")
+
+
+def with_plain_names(header: Header) -> Header:
+    """A header whose vertex properties have the names of 3DGS, without prefixes, but for names that it has already."""
+    elements = []
+    for element in header.elements:
+        names = {name for name, _ in element.properties}
+        properties = []
+        for name, kind in element.properties:
+            found = _PREFIXED.fullmatch(name) if element.name == "vertex" else None
+            plain = name if found is None or found[1] in names else found[1]
+            names.add(plain)
+            properties.append((plain, kind))
+        elements.append(replace(element, properties=tuple(properties)))
+    return replace(header, elements=tuple(elements))
+
+
+def has_plain_colors(names: Container[str]) -> bool:
+    """Whether vertex properties have colours as red, green and blue alone."""
+    return "f_dc_0" not in names and all(name in names for name in COLORS)
+
+
+def dc_of_colors(colors: NDArray[np.float32], kind: np.dtype) -> NDArray[np.float32]:
+    """Constant SH coefficients (N, 3) of red, green and blue (N, 3): whole numbers count in the largest of their type,
+    others are in [0, 1]."""
+    largest = np.iinfo(kind).max if kind.kind in "iu" else 1
+    return ((colors / np.float32(largest) - np.float32(0.5)) / np.float32(SH_C0)).astype(np.float32)
+
+
+def fuse_filter(
+    scales: NDArray[np.float32], opacities: NDArray[np.float32], sizes: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sizes and opacities with Mip-Splatting's 3D filter in them.
+
+    A standard deviation s becomes sqrt(s^2 + f^2), and an opacity is multiplied by the product of s / sqrt(s^2 + f^2)
+    over the axes, the ratio of the square roots of determinants. Source: "Mip-Splatting: Alias-free 3D Gaussian
+    Splatting", Yu et al. 2024, equation 9, as the authors' exporter applies it.
+
+    Args:
+        scales: (N, 3) natural logarithms of standard deviations; (N, 2) for 2D Gaussians.
+        opacities: (N, 1) logits.
+        sizes: (N, 1) standard deviations f of the filter, scene units; 0 changes nothing.
+
+    Returns:
+        New log-scales and logits of the same shapes.
+    """
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        logs = scales.astype(np.float64)
+        wide = 0.5 * np.logaddexp(2 * logs, 2 * np.log(np.abs(sizes.astype(np.float64))))
+        shrunk = np.where(wide == logs, 0.0, logs - wide)  # an axis without size that stays so
+        # Logarithms of the opacity and of what is left of 1: opacities of nearly 1 keep their digits.
+        logits = opacities.astype(np.float64)
+        log_opacity = -np.logaddexp(0.0, -logits) + shrunk.sum(axis=1, keepdims=True)
+        fused = log_opacity - np.log(-np.expm1(log_opacity))
+        return wide.astype(np.float32), np.where(sizes == 0, logits, fused).astype(np.float32)
