@@ -167,7 +167,8 @@ def test_of_several_meshes_is_one_scene(tmp_path):
     ("changes", "said"),
     [
         ({"meshes": []}, "no Gaussians"),
-        ({"about": {"extensions": {"KHR_gaussian_splatting_compression_spz": {}}}}, "compression_spz"),
+        ({"about": {"extensions": {"EXT_other_compression": {}}}}, "EXT_other_compression"),
+        ({"about": {"extensions": {"KHR_gaussian_splatting_compression_spz_2": {}}}}, "lacks 'bufferView'"),
         ({"about": {"kernel": "cube"}}, "the kernel cube"),
         ({"buffers": [{"byteLength": 1, "uri": "a.bin"}]}, "another file"),
         ({"accessors": []}, "damaged glTF"),

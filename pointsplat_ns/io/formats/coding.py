@@ -26,6 +26,10 @@ SATURATED = 0.25
 """Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
 logit that is finite. A logit of infinity would be dropped by some programs."""
 
+PACKED = 100
+"""Most bytes that a compressed byte is taken to hold. 216,000 Gaussians that differ in nothing but their place on a
+grid have 27; trained scenes less than 4."""
+
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 Array = NDArray[Any]
@@ -62,9 +66,8 @@ def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: 
     """Raise a SceneError, before memory is taken, if the header of a compressed file declares more bytes than
     ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel beyond the constant one) than fit
     into memory."""
-    # From a file of any size 4 MB, 200,000 equal Gaussians; beyond that 100 times its bytes. 216,000 Gaussians that
-    # differ in nothing but their place on a grid have 27 times; trained scenes less than 4.
-    if unpacked > max(1 << 22, 100 * packed):
+    # From a file of any size 4 MB, 200,000 equal Gaussians.
+    if unpacked > max(1 << 22, PACKED * packed):
         raise SceneError(
             f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than {packed} compressed "
             "bytes can hold"

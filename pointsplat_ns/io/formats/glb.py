@@ -19,6 +19,7 @@ from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
+    PACKED,
     Array,
     bytes_of_logits,
     damage_named,
@@ -31,6 +32,7 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.formats.spz import decode_spz
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -38,29 +40,42 @@ JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
 
 _EXTENSION = "KHR_gaussian_splatting"
+_SPZ = "KHR_gaussian_splatting_compression_spz"
+"""Inside :data:`_EXTENSION`, mostly with a version: ``_2``."""
+_OLD_SPZ = "KHR_spz_gaussian_splats_compression"
+"""As CesiumJS drew it in 2025, in place of :data:`_EXTENSION`."""
 _MOST_PLACES = 10_000  # nodes with Gaussians
 
 
 def read_glb(path: Path | str) -> Gaussians:
-    """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does, where its nodes place them. Nodes
-    that skew or scale unevenly are not applied, which is logged. Raises SceneError if there are no Gaussians, they are
-    compressed or lie in other files, or the file is damaged."""
+    """Read all Gaussians of a ``.glb``, as :func:`~pointsplat_ns.io.read_scene` does, where its nodes place them; also
+    those that it holds as SPZ, with the axes that they have there. Nodes that skew or scale unevenly are not applied,
+    which is logged. Raises SceneError if there are no Gaussians, they are compressed otherwise or lie in other files,
+    or the file is damaged."""
     path = require_file(path, "a .glb file")
     with damage_named(path, "glTF"):
-        content, binary = _chunks(load_bytes(path), path)
+        data = load_bytes(path)
+        content, binary = _chunks(data, path)
         meshes: dict[int, Gaussians] = {}
+        count = 0
         for index, mesh in enumerate(content.get("meshes", [])):
-            found = [one for one in mesh["primitives"] if _EXTENSION in one.get("extensions", {})]
+            found = [one for one in mesh["primitives"] if {_EXTENSION, _OLD_SPZ} & one.get("extensions", {}).keys()]
             if found:
-                meshes[index] = joined([_primitive(primitive, content, binary, path) for primitive in found])
+                parts = []
+                for primitive in found:
+                    parts.append(_primitive(primitive, content, binary, path))
+                    count += len(parts[-1])
+                    if 17 * count > max(1 << 22, PACKED * len(data)):  # of primitives that share their numbers
+                        raise SceneError(f"{path}: {count} Gaussians and more; {len(data)} bytes cannot hold them")
+                meshes[index] = joined(parts)
         if not meshes:
             raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
         placed = [(meshes[index], matrix) for index, matrix in _shown(content) if index in meshes]
         if len(placed) > _MOST_PLACES:
             raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most {_MOST_PLACES}")
         require_memory(path, 4 * sum(len(mesh) * (11 + 3 * (mesh.sh_degree + 1) ** 2) for mesh, _ in placed))
-        parts = [_moved(mesh, matrix, path) for mesh, matrix in placed]
-    return keep_usable(joined(parts or [*meshes.values()]), path)
+        moved = [_moved(mesh, matrix, path) for mesh, matrix in placed]
+    return keep_usable(joined(moved or [*meshes.values()]), path)
 
 
 def _shown(content: dict[str, Any]) -> list[tuple[int, Array]]:
@@ -135,8 +150,14 @@ def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:
 
 def _primitive(primitive: dict[str, Any], content: dict[str, Any], binary: memoryview, path: Path) -> Gaussians:
     """The Gaussians of one primitive, by the accessors of its attributes."""
-    attributes, about = primitive["attributes"], primitive["extensions"][_EXTENSION]
-    others = [*about.get("extensions", {})]
+    about = primitive["extensions"].get(_EXTENSION, {})
+    inner = about.get("extensions", {})
+    packed = primitive["extensions"].get(_OLD_SPZ) or next(
+        (value for name, value in inner.items() if name.startswith(_SPZ)), None
+    )
+    if packed is not None:
+        return decode_spz(bytes(_view(packed["bufferView"], content, binary, path)), path)
+    attributes, others = primitive["attributes"], [*inner]
     if others or about.get("kernel", "ellipse") != "ellipse":
         wanted = ", ".join([*others, f"the kernel {about.get('kernel')}"])
         raise SceneError(f"{path}: its Gaussians need {wanted}; expected {_EXTENSION} alone, of ellipses")
@@ -173,26 +194,38 @@ def _numbers(index: int, columns: int, content: dict[str, Any], binary: memoryvi
     if "sparse" in accessor or "bufferView" not in accessor:
         raise SceneError(f"{path}: a sparse accessor; expected its numbers in the file's binary chunk")
     view = _entry(content["bufferViews"], accessor["bufferView"])
-    if view["buffer"] != 0 or "uri" in content["buffers"][0]:
-        raise SceneError(f"{path}: its numbers lie in another file; expected them in its binary chunk")
+    part = _view(accessor["bufferView"], content, binary, path)
     types = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
     dtype = np.dtype(types[accessor["componentType"]]).newbyteorder("<")
     if {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]] != columns:
         raise ValueError(f"an accessor of {accessor['type']}, expected {columns} numbers each")
     count, row = accessor["count"], columns * dtype.itemsize
     stride = view.get("byteStride", row)
-    within, begin, length = accessor.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
-    sizes = (count, stride, within, begin, length)
+    within = accessor.get("byteOffset", 0)
+    sizes = (count, stride, within)
     if not all(isinstance(size, int) and size >= 0 for size in sizes) or stride < row:
         raise ValueError(f"sizes {sizes} of an accessor")
     needed = within + stride * (count - 1) + row if count else 0
-    if needed > length or begin + length > len(binary):
-        raise SceneError(f"{path}: truncated; an accessor of {count} entries reaches beyond its {length} bytes")
-    array = np.ndarray((count, columns), dtype, binary, begin + within, (stride, dtype.itemsize))
+    if needed > len(part):
+        raise SceneError(f"{path}: truncated; an accessor of {count} entries reaches beyond its {len(part)} bytes")
+    array = np.ndarray((count, columns), dtype, part, within, (stride, dtype.itemsize))
     values = array.astype(np.float64)
     if accessor.get("normalized") and dtype.kind in "iu":
         values = (values / np.iinfo(dtype).max).clip(-1)
     return values
+
+
+def _view(index: int, content: dict[str, Any], binary: memoryview, path: Path) -> memoryview:
+    """The bytes of a buffer view."""
+    view = _entry(content["bufferViews"], index)
+    if view["buffer"] != 0 or "uri" in content["buffers"][0]:
+        raise SceneError(f"{path}: its numbers lie in another file; expected them in its binary chunk")
+    begin, length = view.get("byteOffset", 0), view["byteLength"]
+    if not all(isinstance(size, int) and size >= 0 for size in (begin, length)):
+        raise ValueError(f"sizes {begin}, {length} of a buffer view")
+    if begin + length > len(binary):
+        raise SceneError(f"{path}: truncated; {length} bytes expected at byte {begin} of {len(binary)}")
+    return binary[begin : begin + length]
 
 
 def _entry(entries: Any, index: Any) -> dict[str, Any]:

@@ -83,20 +83,24 @@ def read_spz(path: Path | str) -> Gaussians:
     Raises SceneError if the file is of another kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
-        data = load_bytes(path)
-        if data[:2] == b"\x1f\x8b":
-            head, parts = _parts_of_gzip(data, path)
-        elif data[:4] == _MAGIC:
-            head, parts = _parts_of_zstd(data, path)
-        else:
-            raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
-        axes = _named_axes(head, data, path) if head.flags & _EXTENDED else None
-        if head.degree > MAX_SH_DEGREE:
-            logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
-        scene = _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
-        if axes is not None:
-            scene = turned(scene, axes)
+        scene = decode_spz(load_bytes(path), path)
     return keep_usable(scene, path)
+
+
+def decode_spz(data: bytes, path: Path) -> Gaussians:
+    """The scene in the bytes of an SPZ file, those Gaussians included that cannot be drawn. ``path`` is what errors
+    name, which are those of :func:`read_spz`."""
+    if data[:2] == b"\x1f\x8b":
+        head, parts = _parts_of_gzip(data, path)
+    elif data[:4] == _MAGIC:
+        head, parts = _parts_of_zstd(data, path)
+    else:
+        raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
+    axes = _named_axes(head, data, path) if head.flags & _EXTENDED else None
+    if head.degree > MAX_SH_DEGREE:
+        logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
+    scene = _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
+    return scene if axes is None else turned(scene, axes)
 
 
 def _named_axes(head: _Head, data: bytes, path: Path) -> Tensor | None:
