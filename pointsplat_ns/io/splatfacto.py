@@ -1,9 +1,12 @@
-"""Splatfacto checkpoints (``nerfstudio_models/step-*.ckpt``)."""
+"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``), gsplat's (``ckpts/ckpt_*_rank0.pt``) and INRIA's
+(``chkpnt*.pth``)."""
 
 from __future__ import annotations
 
 import re
 import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -11,48 +14,168 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, one_line, require_file, require_memory
+from pointsplat_ns.io.files import keep_usable, logger, one_line, require_file, require_memory
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+
+EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """The content of a checkpoint."""
+
+    program: str
+    """The program that saved it: Splatfacto, gsplat or 3DGS."""
+    step: int | None
+    """Steps of the training, as the program counts them; None if it does not say."""
+    values: dict[str, Any]
+    """The parameters by their names in :data:`~pointsplat_ns.gaussians.PARAMETERS`, each with its key in the file."""
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:
-    """Read the scene of a Splatfacto checkpoint.
+    """Read the scene of a checkpoint of Splatfacto, of gsplat's trainer, or of INRIA's 3D Gaussian Splatting.
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
-    logits, they are converted to SH coefficients of the same colour. Gaussians that cannot be drawn (NaN, or Inf where
-    it is not valid) are dropped, and their number is logged.
+    logits, they are converted to SH coefficients of the same colour. Of gsplat's trainings on several GPUs all parts
+    are read. Of 3D Gaussian Splatting the bands of SH are read that the training drew at that step. Gaussians that
+    cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
 
     Returns:
-        The scene, float32 on the CPU, in the frame of the run's dataparser.
+        The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the run's dataparser.
 
     Raises:
         SceneError: if the file is truncated, is no checkpoint, or is one of another method.
     """
-    path = require_file(path, "a Splatfacto checkpoint")
-    state = _pipeline_state(_load(path), path)
+    path = require_file(path, "a checkpoint")
+    parts = [_scene_of(open_checkpoint(part), part) for part in checkpoint_parts(path)]
+    if len({part.sh_degree for part in parts}) > 1:
+        raise SceneError(f"{path}: its parts have different SH degrees; expected those of one training")
+    if len(parts) > 1:
+        logger.info("%s: %d parts of a training on several GPUs are joined", path, len(parts))
+    return keep_usable(Gaussians.cat(parts) if len(parts) > 1 else parts[0], path)
+
+
+def checkpoint_parts(path: Path) -> list[Path]:
+    """The files of a checkpoint: one for each GPU of a training with gsplat, ``ckpt_STEP_rankNUMBER.pt``, else one.
+    Raises SceneError if one of them is missing."""
+    named = re.fullmatch(r"(ckpt_\d+_rank)\d{1,6}\.pt", path.name)
+    if named is None:
+        return [path]
+    pattern = re.compile(re.escape(named[1]) + r"(\d{1,6})\.pt")
+    try:
+        ranks = {int(found[1]): file for file in path.parent.iterdir() if (found := pattern.fullmatch(file.name))}
+    except OSError as error:
+        raise SceneError(f"{path.parent}: cannot be read ({error.strerror or one_line(error)})") from error
+    if path.name not in {file.name for file in ranks.values()}:
+        return [path]
+    missing = sorted({*range(max(ranks))} - ranks.keys())
+    if missing:
+        raise SceneError(
+            f"{path}: a part of a training on several GPUs, and {named[1]}{missing[0]}.pt is missing; expected all "
+            "parts in one folder"
+        )
+    return [require_file(ranks[rank], "a part of a checkpoint") for rank in sorted(ranks)]
+
+
+def open_checkpoint(path: Path) -> Checkpoint:
+    """The content of a checkpoint, its tensors not yet checked. Raises SceneError as :func:`read_checkpoint`."""
+    content = _load(path)
+    if isinstance(content, (tuple, list)) and len(content) == 2 and isinstance(content[0], (tuple, list)):
+        return _of_3dgs(content[0], content[1], path)
+    if isinstance(content, dict) and isinstance(content.get("splats"), dict):
+        return _of_gsplat(content["splats"], content.get("step"), path)
+    state = _pipeline_state(content, path)
     # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of distributed training.
     prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
     prefix = next((p for p in prefixes if f"{p}means" in state), None)
     if prefix is None:
-        keys = sorted(str(key) for key in state)
-        shown = ", ".join(keys[:4]) + (f" and {len(keys) - 4} more" if len(keys) > 4 else "")
         raise SceneError(
-            f"{path}: a checkpoint of another method; found the keys {shown or 'none'}; "
+            f"{path}: a checkpoint of another method; found the keys {_some(state, 4)}; "
             f"expected {prefixes[0]}means, as Splatfacto saves"
         )
+    return Checkpoint(
+        "Splatfacto",
+        _step(content.get("step")),
+        {name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS},
+    )
+
+
+def _of_gsplat(splats: dict[str, Any], step: Any, path: Path) -> Checkpoint:
+    """``{"step": ..., "splats": {means, scales, quats, opacities, sh0, shN}}``, as gsplat's simple_trainer saves."""
+    if "features" in splats and "colors" in splats:
+        raise SceneError(
+            f"{path}: trained by gsplat with appearance optimisation (--app_opt), so that its colours come from a "
+            "network (keys 'features' and 'colors'); expected the SH coefficients sh0 and shN; export a PLY with "
+            "--save_ply, or train without --app_opt"
+        )
+    keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
+    return Checkpoint("gsplat", _step(step), {name: (key, splats.get(key)) for name, key in keys.items()})
+
+
+def _of_3dgs(captured: Any, step: Any, path: Path) -> Checkpoint:
+    """``(GaussianModel.capture(), iteration)``, as INRIA's training saves: twelve entries, of which the first is the
+    active SH degree, and the next are parameters."""
+    names = ("active SH degree", "means", "features_dc", "features_rest", "scales", "quats", "opacities")
+    degree = captured[0] if len(captured) == 12 else None
+    if not isinstance(degree, int) or not 0 <= degree <= 4:
+        raise SceneError(
+            f"{path}: a tuple of {len(captured)} entries and a step; expected the twelve of 3D Gaussian Splatting's "
+            "capture(), the active SH degree first; name the training's PLY instead"
+        )
+    values = dict(zip(names, captured, strict=False))
+    rest = values["features_rest"]
+    if isinstance(rest, Tensor) and rest.dim() == 3:
+        values["features_rest"] = rest[:, : (degree + 1) ** 2 - 1]
+    return Checkpoint("3DGS", _step(step), {name: (name, values[name]) for name in PARAMETERS})
+
+
+def _scene_of(found: Checkpoint, path: Path) -> Gaussians:
+    """The scene of a checkpoint's parameters, those that cannot be drawn included."""
     limit = path.stat().st_size
-    held = (state.get(prefix + name) for name in PARAMETERS)
+    held = (value for _, value in found.values.values())
     require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
-    tensors = [_parameter(state, prefix + name, path, limit) for name in PARAMETERS]
+    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in found.values.items()}
+    if found.program != "Splatfacto":
+        tensors = _reshaped(tensors, path)
     try:
-        scene = Gaussians(*tensors)
+        scene = Gaussians(*(tensors[name] for name in PARAMETERS))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
-    if scene.sh_degree == 0:
+    if found.program == "Splatfacto" and scene.sh_degree == 0:
         scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
-    return keep_usable(scene, path)
+    return scene
+
+
+def _reshaped(tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Parameters of gsplat and of 3DGS in the shapes of :class:`Gaussians`: opacities (N,) or (N, 1), constant SH
+    coefficients (N, 1, 3), SH of degree 4, and two sizes of 2D Gaussians, whose third axis is flat."""
+    opacities, dc, scales = (tensors[name] for name in ("opacities", "features_dc", "scales"))
+    most = (MAX_SH_DEGREE + 1) ** 2 - 1
+    rest = tensors["features_rest"]
+    if rest.dim() == 3 and rest.shape[1] == (MAX_SH_DEGREE + 2) ** 2 - 1:
+        logger.warning("%s: SH degree %d, read up to degree %d", path, MAX_SH_DEGREE + 1, MAX_SH_DEGREE)
+        rest = rest[:, :most].contiguous()
+    if scales.dim() == 2 and scales.shape[1] == 2:
+        logger.warning("%s: 2D Gaussians, read as flat 3D ones", path)
+        scales = torch.cat([scales, torch.full_like(scales[:, :1], -torch.inf)], dim=1)
+    return tensors | {
+        "opacities": opacities[:, None] if opacities.dim() == 1 else opacities,
+        "features_dc": dc[:, 0] if dc.dim() == 3 and dc.shape[1] == 1 else dc,
+        "features_rest": rest,
+        "scales": scales,
+    }
+
+
+def _step(value: Any) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
+
+
+def _some(keys: Iterable[Any], count: int) -> str:
+    """The first of some keys, and how many more there are."""
+    names = sorted(str(key) for key in keys)
+    return (", ".join(names[:count]) or "none") + (f" and {len(names) - count} more" if len(names) > count else "")
 
 
 def is_complete(path: Path) -> bool:
@@ -65,18 +188,17 @@ def is_complete(path: Path) -> bool:
 
 def _load(path: Path) -> Any:
     """Load a checkpoint, with its tensors memory-mapped if it is an archive."""
-    expected = "expected a checkpoint that Splatfacto saved"
     if path.stat().st_size == 0:
-        raise SceneError(f"{path}: the file is empty; {expected}")
+        raise SceneError(f"{path}: the file is empty; {EXPECTED}")
     archive = is_complete(path)
     if not archive and path.open("rb").read(2) == b"PK":
-        raise SceneError(f"{path}: truncated, the archive has no end; {expected}; train or copy it again")
+        raise SceneError(f"{path}: truncated, the archive has no end; {EXPECTED}; train or copy it again")
     allow_splatfacto_checkpoints()
     try:
         if archive:
             with zipfile.ZipFile(path) as content:
                 if sum(entry.file_size for entry in content.infolist()) > path.stat().st_size:
-                    raise SceneError(f"{path}: a compressed archive; {expected}")
+                    raise SceneError(f"{path}: a compressed archive; {EXPECTED}")
         return torch.load(path, map_location="cpu", weights_only=True, mmap=archive)
     except SceneError:
         raise
@@ -84,21 +206,20 @@ def _load(path: Path) -> Any:
         foreign = re.search(r"GLOBAL ([\w.]+)", str(error))
         if foreign:
             raise SceneError(
-                f"{path}: holds an object of type {foreign[1]}, which only running its code could load; {expected}"
+                f"{path}: holds an object of type {foreign[1]}, which only running its code could load; {EXPECTED}"
             ) from error
         raise SceneError(
-            f"{path}: truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)}); {expected}"
+            f"{path}: truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)}); {EXPECTED}"
         ) from error
 
 
 def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
     state = content.get("pipeline") if isinstance(content, dict) else None
     if not isinstance(state, dict):
-        found = (
-            ", ".join(str(key) for key in list(content)[:6]) if isinstance(content, dict) else type(content).__name__
-        )
+        found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
         raise SceneError(
-            f"{path}: not a nerfstudio checkpoint; found {found or 'no keys'}, expected the key 'pipeline'"
+            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of nerfstudio, 'splats' "
+            "of gsplat, or the tuple of 3D Gaussian Splatting"
         )
     return state
 
@@ -113,11 +234,10 @@ def _is_dense(value: Any) -> TypeGuard[Tensor]:
     )
 
 
-def _parameter(state: dict[str, Any], key: str, path: Path, limit: int) -> Tensor:
+def _parameter(value: Any, key: str, path: Path, limit: int) -> Tensor:
     """A float32 copy of one parameter, independent of the mapped file."""
-    value = state.get(key)
     if value is None:
-        raise SceneError(f"{path}: lacks the key {key!r}; expected a Splatfacto checkpoint")
+        raise SceneError(f"{path}: lacks the key {key!r}; {EXPECTED}")
     if not _is_dense(value):
         kind = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else type(value).__name__
         raise SceneError(f"{path}: {key!r} is {kind}; expected a dense floating-point tensor")

@@ -85,7 +85,7 @@ print(torch.load(sys.argv[1], map_location="cpu", weights_only=True)["schedulers
 print("nerfstudio" in sys.modules)
 """
     done = in_fresh_python(code, tmp_path / "a.ckpt")
-    assert done.stdout.split("\n")[:4] == ["refused True", "True 4", "0.0005", "False"], done.stdout + done.stderr
+    assert done.stdout.split("\n")[:4] == ["refused True", "True 5", "0.0005", "False"], done.stdout + done.stderr
 
 
 def rewritten(path, change):
@@ -139,11 +139,11 @@ OTHER_METHOD = {"step": 1, "pipeline": {f"_model.field.mlp.{i}.weight": torch.ze
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        *((some, ["expected a checkpoint that Splatfacto saved"])
+        *((some, ["expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"])
           for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")),
-        ({"state_dict": {}, "epoch": 3}, ["not a nerfstudio checkpoint", "found state_dict, epoch"]),
-        ([1], ["not a nerfstudio checkpoint", "found list"]),
-        ({}, ["not a nerfstudio checkpoint", "no keys"]),
+        ({"state_dict": {}, "epoch": 3}, ["not a checkpoint of a scene", "found epoch, state_dict"]),
+        ([1], ["not a checkpoint of a scene", "found list"]),
+        ({}, ["not a checkpoint of a scene", "found none"]),
         (OTHER_METHOD,
          ["another method", "_model.field.mlp.0.weight", "and 2 more", "_model.gauss_params.means"]),
     ],
