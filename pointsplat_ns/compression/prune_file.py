@@ -14,9 +14,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_read
-from pointsplat_ns.io.formats.compressed_ply import is_compressed
-from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.io.ply import PlyRows, read_ply
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.upright import Up
@@ -173,11 +171,8 @@ def _binary_ply(scene: Path) -> PlyRows | None:
     if not scene.is_file():
         return None
     kind = format_to_read(scene)
-    if kind is None or not kind.suffix.endswith(".ply"):
+    if kind is None or kind.read is not read_ply:
         return None
-    with scene.open("rb") as stream:
-        if is_compressed(read_header(stream, scene)):
-            return None
     return PlyRows.open(scene, warn=False)
 
 

@@ -16,10 +16,10 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.io.files import unusable_kept
-from pointsplat_ns.io.formats import FORMATS, Format, format_name
+from pointsplat_ns.io.formats import FORMATS, Format
 from pointsplat_ns.io.formats.sog import sog_bytes_like
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.io.scene import kind_of, read_scene
 from pointsplat_ns.io.source import source_parts
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
@@ -44,6 +44,7 @@ class SceneInfo:
     file: str
     """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose size is 0."""
     format: str
+    """Name of the format; for a run or a checkpoint also the program or method, and the step."""
     bytes: int
     gaussians: int
     sh_degree: int
@@ -112,7 +113,7 @@ def info(
         with unusable_kept():
             scene = read_scene(scene)
         parts = source_parts(file)
-        kind = format_name(parts[0] if len(parts) == 1 else Path(file))
+        kind = kind_of(file)
         bytes_ = sum(part.stat().st_size for part in parts)
     scene = scene.detach().to("cpu", torch.float32)
     usable = scene.usable()

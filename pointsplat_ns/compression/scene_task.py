@@ -23,7 +23,7 @@ from typing import Any, Literal
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash, logger, one_line, read_text, replacing
-from pointsplat_ns.io.formats import format_named, format_to_write
+from pointsplat_ns.io.formats import format_to_read, format_to_write
 from pointsplat_ns.io.scene import save_as
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
@@ -203,7 +203,7 @@ def _write(task: SceneTask, made: SmallerScene, key: str, options: CommandOption
     """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     with replacing(task.output) as part:
         kind = format_to_write(task.output)
-        if made.same and task.source.is_file() and format_named(task.source.name) is kind:
+        if made.same and task.source.is_file() and format_to_read(task.source) is kind:
             shutil.copyfile(task.source, part)
         else:
             save_as(kind, made.scene, part)

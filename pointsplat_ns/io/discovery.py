@@ -12,8 +12,9 @@ from typing import Literal
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger
-from pointsplat_ns.io.formats import READABLE, format_named
-from pointsplat_ns.io.formats.compressed_ply import is_compressed
+from pointsplat_ns.io.formats import READABLE, format_named, format_to_read
+from pointsplat_ns.io.ply import read_ply
+from pointsplat_ns.io.ply_dialects import with_plain_names
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run, scene_name
 from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
@@ -195,8 +196,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     scenes = []
     for path in sorted(paths):
         why = "" if path.is_file() else "not a regular file"
-        if not why and path.suffix.lower() == ".ply":
-            why = _why_none(path)
+        why = why or _why_none(path)
         if why:
             logger.warning("passed over %s: %s", path, why)
         else:
@@ -252,14 +252,19 @@ def _when(run: Run) -> tuple[float, int]:
 
 
 def _why_none(path: Path) -> str:
-    """Why a PLY holds no Gaussians; empty if it does."""
+    """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it does, or if its reader says it."""
+    try:
+        kind = format_to_read(path)
+    except SceneError:
+        return ""
+    if kind is None or kind.read is not read_ply:
+        return ""
     try:
         with path.open("rb") as stream:
-            header = read_header(stream, path)
+            header = with_plain_names(read_header(stream, path))
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     except SceneError:
         return "no Gaussians in it"
     names = ({name for name, _ in element.properties} for element in header.elements)
-    found = is_compressed(header) or any({"opacity", "scale_0", "rot_0"} <= own for own in names)
-    return "" if found else "no Gaussians in it"
+    return "" if any({"opacity", "scale_0", "rot_0"} <= own for own in names) else "no Gaussians in it"

@@ -33,7 +33,9 @@ class RunFiles:
     """The transform of the dataset from the frame of its poses to that of the scene."""
     refiner: str = "refiner.safetensors"
     """Weights of the refiner that the run trained."""
-    suffixes: tuple[str, ...] = (".ckpt", ".yml", ".yaml")
+    configs: tuple[str, ...] = (".yml", ".yaml")
+    """Ends of the names of configurations."""
+    suffixes: tuple[str, ...] = (".ckpt", *configs)
     """Ends of the names of files that stand for a run."""
 
 

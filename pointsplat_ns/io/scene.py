@@ -12,20 +12,20 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
-from pointsplat_ns.io.splatfacto import read_checkpoint
+from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
-SCENE_KINDS = f"a scene ({READABLE}), a Splatfacto .ckpt, or a Splatfacto run (its folder or config.yml)"
+SCENE_KINDS = (
+    f"a scene ({READABLE}, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a "
+    "Splatfacto run (its folder or config.yml)"
+)
 
 
 def is_scene_file(path: Path | str) -> bool:
     """Whether :func:`read_scene` takes a file for a whole scene, by its suffix. Runs and SOG folders, streamed or not,
     are recognised by their content instead."""
-    path = Path(path)
-    kind = format_named(path.name)
-    return path.suffix.lower() == ".ckpt" or (
-        kind is not None and kind.read is not None and kind.suffix.startswith(".")
-    )
+    kind = format_named(Path(path).name)
+    return kind is not None and kind.read is not None and kind.suffix.startswith(".")
 
 
 def is_folder_of_scenes(path: Path | str) -> bool:
@@ -62,14 +62,9 @@ def read_scene(path: Path | str) -> Gaussians:
         return _scene_of(open_run(path, need_data=False))
     if not path.is_dir():
         require_file(path, SCENE_KINDS)
-    if path.suffix.lower() == ".ckpt":
-        scene = read_checkpoint(path)
-        with suppress(SceneError):  # a checkpoint outside a run
-            return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")
-        return scene
-    if path.suffix.lower() in RUN_FILES.suffixes:
-        return _scene_of(open_run(path, need_data=False))
     kind = format_to_read(path)
+    if kind is None and path.suffix.lower() in RUN_FILES.configs:
+        return _scene_of(open_run(path, need_data=False))
     if kind is None or kind.read is None:
         what = (
             f"a folder without {RUN_FILES.config} or meta.json"
@@ -77,12 +72,41 @@ def read_scene(path: Path | str) -> Gaussians:
             else f"a {path.suffix or 'nameless'} file"
         )
         raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
-    return kind.read(path)
+    scene = kind.read(path)
+    if kind.read is read_checkpoint:
+        with suppress(SceneError):  # a checkpoint outside a run
+            return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")
+    return scene
 
 
 def _scene_of(run: Run) -> Gaussians:
     """The scene of a run's checkpoint, antialiased if the run was trained so."""
     return read_checkpoint(run.checkpoint).replace(antialiased=run.rasterize_mode == "antialiased")
+
+
+def kind_of(path: Path | str) -> str:
+    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run or a checkpoint with
+    its program or method and its step. Raises SceneError as :func:`read_scene`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import pointsplat_ns
+        >>> kind_of(Path(pointsplat_ns.__file__).parent / "examples" / "room.ply")
+        '3DGS PLY'
+    """
+    path = Path(path)
+    in_run = path.is_dir() and (path / RUN_FILES.config).is_file()
+    kind = None if in_run else format_to_read(path)
+    if kind is None:
+        run = open_run(path, need_data=False)
+        return f"run of {run.method_name or 'an unknown method'}, step {run.step}"
+    if kind.read is not read_checkpoint:
+        return kind.name
+    with suppress(SceneError):  # a checkpoint outside a run
+        run = open_run(path, need_data=False)
+        return f"checkpoint of {run.method_name or 'an unknown method'}, step {run.step}"
+    found = open_checkpoint(path)
+    return f"checkpoint of {found.program}" + ("" if found.step is None else f", step {found.step}")
 
 
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) -> None:

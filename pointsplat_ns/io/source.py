@@ -8,15 +8,17 @@ from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import content_hash, one_line
-from pointsplat_ns.io.formats import SOG_META, STREAM_META
+from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_read
 from pointsplat_ns.io.formats.sog_stream import stream_parts
-from pointsplat_ns.io.runs import RUN_FILES, open_run
+from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run
+from pointsplat_ns.io.splatfacto import checkpoint_parts
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """The file that a dense scene was read from. Of a SOG folder, streamed or not, ``bytes`` are those of all its
-    files, and ``sha256`` is that of the lines "path hash" of each, by its path in the folder."""
+    """The file that a dense scene was read from. Of a SOG folder, streamed or not, and of a checkpoint in parts,
+    ``name`` is that of the folder, ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of
+    each, by its path in the folder."""
 
     name: str
     bytes: int
@@ -28,7 +30,7 @@ def source_file(path: Path | str) -> SourceFile:
     SceneError if there is none, or it cannot be read."""
     parts = source_parts(path)
     if len(parts) > 1 or parts[0].name == SOG_META:
-        folder = _folder_of(Path(path))
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
         hashes = "".join(f"{part.relative_to(folder).as_posix()} {content_hash(part)}\n" for part in parts)
         total = sum(part.stat().st_size for part in parts)
         return SourceFile(folder.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
@@ -38,15 +40,16 @@ def source_file(path: Path | str) -> SourceFile:
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, or
-    one. Raises SceneError if a run has none, or a folder cannot be read."""
+    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, all
+    parts of a checkpoint, or one. Raises SceneError if a run has none, or a folder cannot be read."""
     path = Path(path)
     parts = _sog_parts(path)
     if parts:
         return parts
-    if path.is_dir() or path.suffix.lower() in RUN_FILES.suffixes:
+    kind = format_to_read(path) if path.is_file() else None
+    if kind is None and may_be_run(path):
         return [open_run(path, need_data=False).checkpoint]
-    return [path]
+    return checkpoint_parts(path)
 
 
 def _folder_of(path: Path) -> Path:

@@ -16,9 +16,9 @@ from hypothesis.extra import numpy as arrays
 import pointsplat_ns as ps
 from making import normal_scene, same, same_bits
 from pointsplat_ns.io.files import keep_usable
-from pointsplat_ns.io.formats import format_name
 from pointsplat_ns.io.formats.sog_stream import Node, read_sog_stream, write_sog_stream
 from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.io.scene import kind_of
 
 FINE, COARSE = 300, 60
 
@@ -45,7 +45,7 @@ def changed(folder: Path, **changes) -> Path:
 def test_each_level_is_read_whole_the_finest_by_default(folder):
     assert len(ps.load(folder)) == FINE and same(ps.load(folder), ps.load(folder / "lod-meta.json"))
     assert len(read_sog_stream(folder, 1)) == COARSE == len(read_sog_stream(folder, -1))
-    assert format_name(folder) == "streamed SOG" == ps.info(folder).format
+    assert kind_of(folder) == "streamed SOG" == ps.info(folder).format
 
 
 def test_a_box_holds_one_standard_deviation_of_every_gaussian(folder):

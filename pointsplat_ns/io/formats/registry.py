@@ -1,7 +1,13 @@
-"""The formats of scene files: which there are, and which one a path means."""
+"""The formats of scene files: which there are, and which one a path means.
+
+One table decides for every file: what a file begins with, or for a zip archive what is in it, tells the format,
+whatever its name. Only formats without a sign of their own (``.splat``, ``.ksplat``) go by the name.
+"""
 
 from __future__ import annotations
 
+import fnmatch
+import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
     compressed_ply_bytes,
@@ -27,8 +33,10 @@ from pointsplat_ns.io.formats.sog_images import META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
 from pointsplat_ns.io.formats.spz import encode_spz, read_spz, rounded_for_spz
+from pointsplat_ns.io.formats.zipped import read_zipped
 from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress
 
 Writer = Callable[[Gaussians, Path, Progress], None]
@@ -40,11 +48,15 @@ class Format:
 
     name: str
     suffix: str
-    """The end of its files' names, lower case."""
+    """The end of its files' names, lower case; empty for a format that only its content tells."""
     read: Callable[[Path], Gaussians] | None = None
     write: Writer | None = None
     starts: tuple[bytes, ...] = ()
     """What its files begin with, if that tells."""
+    holds: str = ""
+    """Pattern of the name of a file, without folders, in its zip archives, if that tells."""
+    instead: str = ""
+    """What to do with a file of a format that is not read."""
     bytes_of: Callable[[int, int, Traits], int] | None = None
     """Exact size of a file, bytes, by the number of Gaussians, their SH degree, and the scene's traits; None
     if it depends on more."""
@@ -65,7 +77,7 @@ class Format:
     def fits(self, path: Path) -> bool:
         """Whether a file's name is one of this format."""
         name = path.name.lower()
-        return name.endswith(self.suffix) if self.suffix.startswith(".") else name == self.suffix
+        return name.endswith(self.suffix) if self.suffix.startswith(".") else name == self.suffix != ""
 
 
 def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
@@ -79,30 +91,32 @@ def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
     return write
 
 
-def _read_any_ply(path: Path) -> Gaussians:
-    """Read a PLY, which its header tells to be compressed or not."""
-    with path.open("rb") as stream:
-        header = read_header(stream, path)
-    return read_compressed_ply(path) if is_compressed(header) else read_ply(path)
-
+_PLY = (b"ply\n", b"ply\r")
+_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+_LCC = "convert them to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
+_EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 
 FORMATS = (
-    # Longer ends of names come before those that they end with.
+    # Longer ends of names come before those that they end with; what several formats hold after what one holds.
     Format(
-        "compressed PLY", ".compressed.ply", _read_any_ply, _writer(encode_compressed_ply), (b"ply\n", b"ply\r"),
-        compressed_ply_bytes, order=morton_order,
+        "compressed PLY", ".compressed.ply", read_compressed_ply, _writer(encode_compressed_ply), _PLY,
+        bytes_of=compressed_ply_bytes, order=morton_order,
+    ),
+    Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes),
+    Format(
+        "SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b\x08", b"NGSP"), encode=encode_spz,
+        rounded=rounded_for_spz,
     ),
     Format(
-        "3DGS PLY", ".ply", _read_any_ply, lambda scene, path, _: write_ply(scene, path), (b"ply\n", b"ply\r"),
-        ply_bytes,
+        "SuperSplat project", ".ssproj", holds="document.json",
+        instead="open it in SuperSplat and export the scene as .ply, .sog or .spz",
     ),
+    Format("zip of a streamed SOG", "", holds="lod-meta.json", instead="unpack it and name its folder"),
     Format(
-        "SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b", b"NGSP"), encode=encode_spz, rounded=rounded_for_spz
-    ),
-    Format(
-        "SOG", ".sog", read_sog, _writer(encode_sog), (b"PK\x03\x04",), encode=encode_sog, rounded=rounded_for_sog,
+        "SOG", ".sog", read_sog, _writer(encode_sog), holds="meta.json", encode=encode_sog, rounded=rounded_for_sog,
         order=morton_order,
     ),
+    Format("checkpoint", ".ckpt", read_checkpoint, starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",), holds="data.pkl"),
     Format("streamed SOG", STREAM_META, read_sog_stream),
     Format(
         "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog, order=morton_order
@@ -112,12 +126,21 @@ FORMATS = (
         "splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes,
         holds_antialiased=False, order=drawing_order,
     ),
-    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), glb_bytes, holds_antialiased=False),
-    Format("LCC", ".lcc"), Format("LCC", ".lcc2"),
+    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), bytes_of=glb_bytes, holds_antialiased=False),
+    Format("zipped PLY", "", read_zipped, holds="*.ply"),
+    Format("LCC", ".lcc", instead=_LCC), Format("LCC", ".lcc2", instead=_LCC),
+    Format("Postshot project", ".psht", instead=_EXPORT),
+    Format("RAD", ".rad", instead=_EXPORT),
+    Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
+    Format("glTF with separate files", ".gltf", instead="convert it to one .glb file"),
+    Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
+    Format("E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it holds points, no Gaussians"),
+    Format("Git LFS pointer", "", starts=(b"version https://git-lfs",), instead="fetch the file with git lfs pull"),
+    Format("web page", "", starts=(b"<!DOCTYPE", b"<!doctype", b"<html"), instead="download the file again"),
 )  # fmt: skip
-"""All formats of files that hold nothing but a scene."""
+"""All formats of files that hold nothing but a scene, and those that are refused by name."""
 
-READABLE = ", ".join(kind.suffix for kind in FORMATS if kind.read)
+READABLE = ", ".join(kind.suffix for kind in FORMATS if kind.read and kind.suffix not in ("", ".ckpt"))
 WRITABLE = ", ".join(kind.suffix for kind in FORMATS if kind.write)
 
 
@@ -127,33 +150,49 @@ def format_named(name: str) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """The format of a file or SOG folder, streamed or not, by its first bytes, else by its name; None if neither is
+    """The format of a file or SOG folder, streamed or not, by its content, else by its name; None if neither is
     known. Raises SceneError if the file cannot be read, or its format is known and not read."""
     if path.is_dir():
         return next((format_named(name) for name in (STREAM_META, META) if (path / name).is_file()), None)
-    named = format_named(path.name)
     try:
         with path.open("rb") as stream:
-            start = stream.read(8)
+            start = stream.read(64)
+        kind = _told_by_content(path, start) or format_named(path.name)
     except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
-    if named is None or named.starts and not start.startswith(named.starts):
-        named = next((kind for kind in FORMATS if kind.starts and start.startswith(kind.starts)), named)
-    if named is not None and named.read is None:
-        raise SceneError(f"{path}: {named.name} files are not read; expected one of {READABLE}")
-    return named
+        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
+    if kind is not None and kind.read is None:
+        raise SceneError(f"{path}: {kind.name} files are not read; {kind.instead}")
+    return kind
 
 
-def format_name(path: Path) -> str:
-    """Name of the format of a file or SOG folder that can be read; a PLY's is that of its header, not of its name.
-    Raises SceneError as :func:`format_to_read`, or if a PLY's header is damaged."""
-    kind = format_to_read(path)
-    if kind is None:
-        return "Splatfacto checkpoint"
-    if kind.read is not _read_any_ply:
-        return kind.name
-    with path.open("rb") as stream:
-        return FORMATS[0 if is_compressed(read_header(stream, path)) else 1].name
+def _told_by_content(path: Path, start: bytes) -> Format | None:
+    """The format that a file's content tells, from its first bytes on; None if it tells none."""
+    if start.startswith(_ZIP):
+        return _told_by_zip(path)
+    kind = next((kind for kind in FORMATS if start.startswith(kind.starts)), None)
+    if kind is not None and kind.starts == _PLY:
+        with suppress(SceneError), path.open("rb") as stream:  # what is damaged, its reader says
+            return FORMATS[0 if is_compressed(read_header(stream, path)) else 1]
+    return kind
+
+
+def _told_by_zip(path: Path) -> Format | None:
+    """The format that the names in a zip archive tell. Raises SceneError if they tell none; None if the archive has no
+    end, and the name of the file is one of a format that is an archive."""
+    named = format_named(path.name)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, RuntimeError) as error:
+        if named is not None and named.holds:
+            return None
+        raise SceneError(f"{path}: a zip archive that is truncated or damaged ({one_line(error)})") from error
+    files = [name.rpartition("/")[2].lower() for name in names]
+    told = next((kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None)
+    if told is None:
+        found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected one of a PLY, a SOG or a checkpoint")
+    return told
 
 
 def format_to_write(path: Path | str) -> Format:
@@ -168,11 +207,9 @@ def format_to_write(path: Path | str) -> Format:
 
 def format_like(path: Path) -> Format:
     """The format to write what is made of a scene: that of the scene's file if it can be written, else PLY."""
-    kind = format_named(path.name)
-    if path.is_dir() or kind is None or kind.write is None:
-        return format_to_write(".ply")
-    if kind.suffix == ".ply":
-        with suppress(SceneError, OSError), path.open("rb") as stream:
-            if is_compressed(read_header(stream, path)):
-                return format_to_write(".compressed.ply")
-    return kind
+    if not path.is_dir():
+        with suppress(SceneError):  # one that cannot be read, which its reader says
+            kind = format_to_read(path)
+            if kind is not None and kind.write is not None and kind.suffix.startswith("."):
+                return kind
+    return format_to_write(".ply")

@@ -33,13 +33,17 @@ _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("q
 
 def read_splat(path: Path | str) -> Gaussians:
     """Read a ``.splat`` file, as :func:`~pointsplat_ns.io.read_scene` does; the SH degree is 0. Raises SceneError if
-    its size is not a multiple of 32 bytes, or it does not fit into memory."""
+    its size is not a multiple of 32 bytes, it is text, or it does not fit into memory."""
     path = require_file(path, "a .splat file")
     size = path.stat().st_size
     if size % _ROW.itemsize:
         raise SceneError(
             f"{path}: {size} bytes, not a multiple of {_ROW.itemsize}; expected {_ROW.itemsize} bytes a Gaussian"
         )
+    with path.open("rb") as stream:
+        start = stream.read(4096)
+    if start and start.isascii() and start.decode().replace("\n", "").replace("\r", "").replace("\t", "").isprintable():
+        raise SceneError(f"{path}: text ({start[:24]!r}...); expected the rows of a .splat file")
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
     with damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
