@@ -35,14 +35,15 @@ def is_folder_of_scenes(path: Path | str) -> bool:
 
 
 def read_scene(path: Path | str) -> Gaussians:
-    """Read a scene: a file of any format, a Splatfacto checkpoint, or the newest checkpoint of a Splatfacto run.
+    """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a Splatfacto run.
 
-    The first bytes of a file decide its format, else its name.
+    The content of a file decides its format, else its name.
 
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
             SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, ``.ksplat``,
-            ``.ckpt``, ``config.yml`` or a run's folder. The photos of a run are not needed.
+            ``.glb``, a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
+            ``config.yml`` or a run's folder. The photos of a run are not needed.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.

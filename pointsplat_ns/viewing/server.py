@@ -22,7 +22,9 @@ from urllib.parse import parse_qsl, urlsplit
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.formats import FORMATS
 
-READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".ckpt")
+READABLE_NAMES = (
+    *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt", ".pth", ".zip",
+)  # fmt: skip
 """Ends of the names of files that may be dropped."""
 
 
