@@ -73,6 +73,12 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     return views, photos
 
 
+def has_masks(path: Path | str, split: Split) -> bool:
+    """Whether photos of a split have masks. Arguments and errors are those of :func:`dataset_views`."""
+    _, frames = _open(path, split)
+    return any(frames.dataset._dataparser_outputs.mask_filenames or ())
+
+
 def training_photos(path: Path | str) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""

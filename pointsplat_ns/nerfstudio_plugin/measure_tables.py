@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.runs import Run, may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, has_masks
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.tables.cells import TABLE_FILES
@@ -150,7 +151,34 @@ def _open(path: Path, options: TableOptions) -> OpenedScene:
         return ViewSource(dense, run=path, dataset_views=dataset_views)
 
     held_out, training = _looked_at(path, options) or _sampled(new_views(), options)
-    return OpenedScene(dense, held_out.resized(options.side), training.resized(options.side), new_views)
+    judged = held_out.resized(options.side)
+    differs = _differences(path, dense, held_out, judged)
+    return OpenedScene(dense, judged, training.resized(options.side), new_views, differs)
+
+
+def _differences(path: Path, dense: Gaussians, held_out: JudgedViews, judged: JudgedViews) -> tuple[str, ...]:
+    """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000 Splatfacto steps, judged by
+    all held-out photos in their full size. ``held_out`` are the views before they are resized to the ``judged`` ones.
+    """
+    if held_out.photos is None:
+        return ("no held-out photos",)
+    run, found = open_run(path), []
+    everything = len(dataset_views(path, "test"))
+    if len(held_out.views) < everything:
+        found.append(f"{len(held_out.views)} of {everything} held-out photos")
+    scale = run.datamanager_fields.get("camera_res_scale_factor", 1.0)
+    scale /= run.dataparser_fields.get("downscale_factor") or 1
+    if judged.views.width < held_out.views.width:
+        found.append(f"photos reduced to {judged.views.width} of {held_out.views.width} pixels in width")
+    elif scale != 1.0:
+        found.append(f"photos reduced to {scale:g} of their width")
+    if dense.sh_degree != 3:
+        found.append(f"SH degree {dense.sh_degree}")
+    if run.step + 1 < PROTOCOL.dense_steps:
+        found.append(f"{run.step + 1:,} of {PROTOCOL.dense_steps:,} Splatfacto steps")
+    if has_masks(path, "test"):
+        found.append("masks are not applied")
+    return tuple(found)
 
 
 def _looked_at(path: Path, options: TableOptions) -> tuple[JudgedViews, JudgedViews] | None:
@@ -184,7 +212,11 @@ def paper_dataset(run: Run) -> str:
         size = (scene.params.width, scene.params.height)
         # The rooms that this package makes may have the same names, but not this size and number.
         return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
-    ours, theirs = "SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig"
-    if parser in (ours, theirs) and re.fullmatch(r"[0-9a-f]{10}", name) and (run.data / "dslr").is_dir():
+    # By the dataset's own files, or by the COLMAP model among them, as the paper's authors read it.
+    parsers = {"SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig", "ColmapDataParserConfig"}
+    folders = (run.data, *run.data.parents) if parser == "ColmapDataParserConfig" else (run.data,)
+    if parser in parsers and any(
+        re.fullmatch(r"[0-9a-f]{10}", folder.name) and (folder / "dslr").is_dir() for folder in folders[:4]
+    ):
         return "ScanNet++"
     return ""

@@ -104,6 +104,8 @@ class About:
     """Number of views."""
     width: int
     height: int
+    differs: str = "measured by an older version"
+    """Differences from the paper's protocol; empty if there are none."""
 
 
 def identity(scene: TableScene, options: TableOptions, machine: str) -> dict[str, str | int]:
@@ -180,9 +182,9 @@ def _cell(values: dict[str, Any]) -> Cell:
 
 def _about(of: dict[str, Any], path: Path) -> About:
     try:
-        about = About(**{field.name: of[field.name] for field in dataclasses.fields(About)})
+        about = About(**{field.name: of[field.name] for field in dataclasses.fields(About) if field.name in of})
         check_types(about)
-    except (KeyError, ValueError) as error:
+    except (TypeError, ValueError) as error:
         raise SceneError(
             f"{path}: not the cells of a scene's tables ({one_line(error)}); name another folder, or start over with "
             "--force"

@@ -94,17 +94,18 @@ class Layout:
     def _of_quality(
         self, number: int, title: str, first: Row, sections: Sequence[Sequence[tuple[Row, Way, float]]]
     ) -> Table:
-        """A table of PSNR, SSIM and LPIPS, with the paper's figures where the dataset is the same."""
+        """A table of PSNR, SSIM and LPIPS, with the paper's PSNR and SSIM where dataset and protocol are the paper's.
+        Its LPIPS is by another network."""
         cells = [(way, share) for section in sections for _, way, share in section]
         over = self._shared(cells)
-        dataset = self.group.dataset
+        dataset = self.group.comparable_dataset
         with_paper = any(published(number, dataset, way.name, share) for way, share in cells)
         metrics = ("PSNR", "SSIM", "LPIPS")
         header = first
         header += metrics if self.group.has_photos else ()
         header += tuple(f"{name} (renders)" for name in metrics)
         header += ("loses most", "scenes")
-        header += tuple(f"{name} (paper)" for name in metrics) if with_paper else ()
+        header += tuple(f"{name} (paper)" for name in metrics[:2]) if with_paper else ()
 
         def row(words: Row, way: Way, share: float) -> Row:
             mean = self.group.mean(way.name, share, over)
@@ -113,7 +114,7 @@ class Layout:
             else:
                 figures = _quality(mean.photos) if self.group.has_photos else ()
                 figures += (*_quality(mean.renders), _worst(mean), _scenes(mean))
-            theirs = _quality(published(number, dataset, way.name, share)) if with_paper else ()
+            theirs = _quality(published(number, dataset, way.name, share))[:2] if with_paper else ()
             return (*words, *figures, *theirs)
 
         rows = tuple(tuple(row(*entry) for entry in section) for section in sections)

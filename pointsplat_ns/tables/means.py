@@ -69,6 +69,12 @@ class Group:
         return datasets.pop() if len(datasets) == 1 and datasets <= {*PROTOCOL.datasets} else ""
 
     @property
+    def comparable_dataset(self) -> str:
+        """The dataset whose published figures compare with the group's: all scenes are of it, and were measured by the
+        paper's protocol; empty if there is none."""
+        return "" if any(scene.about.differs for scene in self.scenes) else self.dataset
+
+    @property
     def has_photos(self) -> bool:
         """Whether some cells were compared with photos."""
         return any(cell.point.against_photos is not None for scene in self.scenes for cell in scene.cells.values())

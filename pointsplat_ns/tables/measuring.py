@@ -180,6 +180,7 @@ class _SceneWork:
             views=len(held_out.views),
             width=held_out.views.width,
             height=held_out.views.height,
+            differs="; ".join(self._opened[0].differs),
         )
 
     def _point(self, way: Way, share: float, made: MadeScene, judged: Judged) -> Point:

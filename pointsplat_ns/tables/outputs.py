@@ -53,7 +53,9 @@ def _markdown(groups: Sequence[Group], tables: Mapping[str, Sequence[Table]]) ->
     lines = [READING, "", *(line for note in _notes(groups) for line in (markdown_text(note), ""))]
     for group in groups:
         lines += [f"## {markdown_text(group.name)}", ""]
-        lines += ["| scene | Gaussians | judged in | size |", "|---|---|---|---|"]
+        differs = bool(group.dataset) and not group.comparable_dataset
+        lines += ["| scene | Gaussians | judged in | size |" + " differs from the paper in |" * differs]
+        lines += ["|---|---|---|---|" + "---|" * differs]
         for scene in group.scenes:
             about, dense = scene.about, scene.cells.get((WAYS.dense.name, 1.0))
             words = (
@@ -61,6 +63,7 @@ def _markdown(groups: Sequence[Group], tables: Mapping[str, Sequence[Table]]) ->
                 "-" if dense is None else f"{dense.point.gaussians:,}",
                 f"{about.views} {about.origin}",
                 f"{about.width} x {about.height}",
+                *((about.differs,) if differs else ()),
             )
             lines.append("| " + " | ".join(map(markdown_text, words)) + " |")
         lines += ["", *(markdown_table(table) for table in tables[group.name])]
@@ -81,10 +84,10 @@ def _notes(groups: Sequence[Group]) -> list[str]:
             f"The machine was busy: while {len(busy)} of {len(cells)} cells were timed, other programs took up to "
             f"{max(busy):.1f} cores. Table 2 leaves their frames a second out; --only measures them again."
         )
-    if any(group.dataset for group in groups):
+    if any(group.comparable_dataset for group in groups):
         notes.append(
-            "The paper's Table 2 and Figure 4 do not say of which scenes they are, so nothing of theirs is shown "
-            "beside ours."
+            "The paper's Table 2 and Figure 4 do not say of which scenes they are, and its LPIPS is by VGG, so nothing "
+            "of theirs is shown beside ours."
         )
     return notes
 
@@ -98,17 +101,17 @@ def _content(groups: Sequence[Group], missing: Mapping[str, str]) -> dict[str, A
         "cells": [
             dataclasses.asdict(cell) for group in groups for scene in group.scenes for cell in scene.cells.values()
         ],
-        "paper": {group.name: _published(group) for group in groups if group.dataset},
+        "paper": {group.name: _published(group) for group in groups if group.comparable_dataset},
         "not_measured": dict(missing),
     }
 
 
 def _published(group: Group) -> dict[str, Any]:
-    """The paper's figures for a group of the same dataset, by table, way and share."""
+    """The paper's figures for a group of the same dataset and protocol, by table, way and share."""
     found: dict[str, Any] = {}
     for number in (1, 3, 4):
         for way, share in sorted({key for scene in group.scenes for key in scene.cells}):
-            quality = published(number, group.dataset, way, share)
+            quality = published(number, group.comparable_dataset, way, share)
             if quality is not None:
                 found[f"table {number}, {way}, {100 * share:g}%"] = dataclasses.asdict(quality)
     return found

@@ -23,6 +23,8 @@ class OpenedScene:
     """Views of fine-tuning, with training photos where there are some."""
     new_views: Callable[[], ViewSource]
     """Makes a new source of views, the same as for the commands ``prune`` and ``compact``."""
+    differs: tuple[str, ...] = ()
+    """Differences from the paper's protocol."""
 
 
 @dataclass(frozen=True, eq=False)

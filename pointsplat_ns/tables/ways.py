@@ -24,6 +24,8 @@ class Protocol:
     """Lambda in Table 3."""
     datasets: tuple[str, ...] = ("ScanNet++", "Replica")
     """In the order of the paper's columns."""
+    dense_steps: int = 15_000
+    """Number of Splatfacto's steps for a dense scene."""
     figure_share: float = 0.5
     """Share of the Gaussians in Figure 4."""
     seed: int = 0

@@ -8,13 +8,16 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import write_run
+from making import ball, write_run
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.nerfstudio_plugin import measure_tables
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.measure_tables import paper_dataset
 from pointsplat_ns.nerfstudio_plugin.running import has_finished, remove_interrupted
 from pointsplat_ns.tables import outputs
 from pointsplat_ns.tradeoff import machine
+from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
 def files(folder: Path) -> dict[Path, bytes]:
@@ -45,7 +48,7 @@ def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_
     assert points["dense"].against_photos.psnr == pytest.approx(float(errors.mean()), abs=1e-4)
     assert points["lightgaussian-tuned"].against_photos.psnr > points["lightgaussian"].against_photos.psnr
     assert points["lightgaussian-tuned"].against_dense.psnr < 100 and scene.about.origin == "held-out photos"
-    assert scene.about.dataset == "" and group.name == "scenes"
+    assert scene.about.dataset == "" and group.name == "scenes" and "Splatfacto steps" in scene.about.differs
     written = json.loads((tmp_path / "tables" / "tables.json").read_text())
     assert written["cells"][0]["point"]["against_photos"]["psnr"] == points["dense"].against_photos.psnr
 
@@ -95,4 +98,46 @@ def test_scannetpp_is_known_by_the_names_of_its_scenes(tmp_path):
     assert paper_dataset(run(tmp_path / "0a5c013435", "nerfstudio.NerfstudioDataParserConfig")) == ""
 
 
+def test_scannetpp_is_known_by_its_colmap_model_as_the_authors_read_it(tmp_path):
+    colmap = "nerfstudio.data.dataparsers.colmap_dataparser.ColmapDataParserConfig"
+    for name in ("0a5c013435", "fox"):
+        (tmp_path / name / "dslr" / "colmap").mkdir(parents=True)
+    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr" / "colmap", colmap)) == "ScanNet++"
+    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr", colmap)) == "ScanNet++"
+    assert paper_dataset(run(tmp_path / "fox" / "dslr", colmap)) == ""
+
+
 SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParserConfig"
+
+
+@pytest.mark.parametrize(
+    "change, differs",
+    [
+        ({}, ()),
+        ({"seen": 2}, ("2 of 3 held-out photos",)),
+        ({"side": 32}, ("photos reduced to 32 of 64 pixels in width",)),
+        ({"scale": 0.5}, ("photos reduced to 0.5 of their width",)),
+        ({"downscale": 4}, ("photos reduced to 0.25 of their width",)),
+        ({"sh_degree": 0}, ("SH degree 0",)),
+        ({"step": 1999}, ("2,000 of 15,000 Splatfacto steps",)),
+        ({"masks": True}, ("masks are not applied",)),
+        ({"photos": False}, ("no held-out photos",)),
+        ({"seen": 1, "step": 0}, ("1 of 3 held-out photos", "1 of 15,000 Splatfacto steps")),
+    ],
+)
+def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, differs):
+    case = {"seen": 3, "side": 64, "scale": 1.0, "downscale": None, "sh_degree": 3, "step": 14_999, "masks": False}
+    case |= {"photos": True, **change}
+    poses = sample_views(ball(20), 3, 64, 48)
+    known = SimpleNamespace(
+        step=case["step"],
+        datamanager_fields={"camera_res_scale_factor": case["scale"]},
+        dataparser_fields={"downscale_factor": case["downscale"]},
+    )
+    for name, value in (("open_run", known), ("dataset_views", poses), ("has_masks", case["masks"])):
+        monkeypatch.setattr(measure_tables, name, lambda *_, value=value: value)
+    shown = poses[: case["seen"]]
+    photos = [torch.zeros(48, 64, 3) for _ in shown] if case["photos"] else None
+    held_out = JudgedViews(shown, photos, "held-out photos")
+    scene = ball(20, degree=case["sh_degree"])
+    assert measure_tables._differences(Path("run"), scene, held_out, held_out.resized(case["side"])) == differs

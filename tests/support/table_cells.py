@@ -10,9 +10,9 @@ from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
 
 
-def about(name: str, group: str = "scenes", dataset: str = "") -> About:
+def about(name: str, group: str = "scenes", dataset: str = "", differs: str = "") -> About:
     """A scene judged in three views."""
-    return About(name, f"outputs/{name}", dataset, group, "held-out photos", "a machine", 3, 64, 48)
+    return About(name, f"outputs/{name}", dataset, group, "held-out photos", "a machine", 3, 64, 48, differs)
 
 
 def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -> Cell:
@@ -49,6 +49,7 @@ def write_scene(
     worse: float = 0.0,
     photos: bool = True,
     without: tuple[str, ...] = (),
+    differs: str = "",
 ) -> CellJournal:
     """Write the cells of a scene at 30 and 10 %, in all ways but those without."""
     journal = CellJournal(folder, name)
@@ -58,5 +59,5 @@ def write_scene(
         against = 30.0 - lost if photos else None
         if way.name not in without:
             made = cell(name, way, share, math.inf if dense else 40 - lost, against)
-            journal.add(made, about(name, group, dataset), IDENTITY)
+            journal.add(made, about(name, group, dataset, differs), IDENTITY)
     return journal
