@@ -23,7 +23,7 @@ from typing import Any
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.system.kernels import cache_folder
+from pointsplat_ns.system.native_libraries import cache_folder
 
 logger = logging.getLogger("pointsplat_ns")
 

@@ -8,17 +8,13 @@ arrays, pointers and earlier structs.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
-import hashlib
+import logging
 import math
 import os
 import re
-import shutil
-import stat
-import subprocess
-import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +22,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+
+from pointsplat_ns.system.native_libraries import NativeCodeError, NoCompilerError, load_native
+
+logger = logging.getLogger("pointsplat_ns")
 
 _NUMBERS = {
     "int": (ctypes.c_int, None),
@@ -128,119 +128,74 @@ def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tupl
         yield parts[2], kind
 
 
-_FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
-
-_SHARED = Path(__file__).with_name("include")
-"""Folder of the headers that several files include."""
-
-
-class NativeCodeError(Exception):
-    """There is no native code; the text says why, in one line."""
-
-
-@functools.cache
-def load_native(source: Path) -> ctypes.CDLL:
-    """Compile a C++ file, which may include headers (``.h``) that lie beside it or in ``include``, unless that was done
-    before, and load it.
-
-    The library lies in a folder of the user's, which others cannot write to, named by a hash of the source, the
-    compiler and the processor. Where no such folder can be had it is built anew for each process. Raises
-    NativeCodeError if there is no compiler, or it fails.
-    """
-    compiler = _compiler()
-    machine, macros = _target(compiler)
-    texts = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")), *sorted(_SHARED.glob("*.h")))]
-    key = hashlib.sha256(b"\0".join([*texts, macros, " ".join((compiler, machine, *_FLAGS)).encode()]))
-    name = f"{source.stem}-{key.hexdigest()[:20]}.so"
-    folder = cache_folder()
-    with contextlib.ExitStack() as stack:
-        if folder is None:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pointsplat-")))
-        library = folder / name
-        try:
-            if not library.is_file():
-                _build(compiler, machine, source, library)
-            return ctypes.CDLL(str(library))
-        except OSError as error:
-            raise NativeCodeError(f"{library}: {_first_line(str(error))}") from error
-
-
-def _compiler() -> str:
-    """Path of a C++ compiler."""
-    named = os.environ.get("CXX")
-    found = next(filter(None, map(shutil.which, [named] if named else ("c++", "g++", "clang++"))), None)
-    if found is None:
-        raise NativeCodeError(f"CXX is {named}, which is not there" if named else "there is no C++ compiler")
-    return found
-
-
-@functools.cache
-def _target(compiler: str) -> tuple[str, bytes]:
-    """The flag for this processor, and what the compiler then defines: its version and what the processor can do."""
-    # Flags for code of this very processor: compilers know one or the other.
-    for machine in ("-march=native", "-mcpu=native", ""):
-        arguments = [compiler, *filter(None, [machine]), "-dM", "-E", "-x", "c++", os.devnull]
-        ran = _run(arguments)
-        if ran.returncode == 0:
-            return machine, ran.stdout
-    raise NativeCodeError(f"{compiler}: {_first_line(ran.stderr.decode(errors='replace'))}")
-
-
-def _build(compiler: str, machine: str, source: Path, library: Path) -> None:
-    """Compile beside and rename, so that a library that is there is whole."""
-    handle, part = tempfile.mkstemp(dir=library.parent, prefix=".", suffix=".part")
-    os.close(handle)
-    try:
-        ran = _run([compiler, *_FLAGS, f"-I{_SHARED}", *filter(None, [machine]), "-o", part, str(source)])
-        if ran.returncode != 0:
-            raise NativeCodeError(f"{compiler}: {_first_line(ran.stderr.decode(errors='replace'))}")
-        os.replace(part, library)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(part)
-
-
-def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
-    try:
-        return subprocess.run(arguments, capture_output=True, stdin=subprocess.DEVNULL, timeout=120.0, check=False)
-    except (OSError, subprocess.SubprocessError) as error:
-        raise NativeCodeError(f"{arguments[0]}: {_first_line(str(error))}") from error
-
-
-def cache_folder() -> Path | None:
-    """The folder for built libraries, which is the user's alone: that of the environment variable POINTSPLAT_CACHE, by
-    default pointsplat_ns in the user's cache folder. None if there is none."""
-    named = os.environ.get("POINTSPLAT_CACHE")
-    home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
-    folder = Path(named) if named else Path(home) / "pointsplat_ns"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        about = folder.stat()
-    except (OSError, RuntimeError):  # the second: a home that is not known
-        return None
-    shared = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
-    return folder if ours and not shared and os.access(folder, os.W_OK) else None
-
-
-def _first_line(text: str) -> str:
-    """The first line that says something, cut to a readable length."""
-    return next((line.strip() for line in text.splitlines() if line.strip()), "no reason given")[:200]
-
-
 SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
+
+
+class _Together:
+    """Kernels that are used all or not at all, because results would else be rounded by the one here and by torch
+    there."""
+
+    def __init__(self, sources: Sequence[Path]):
+        self.sources, self.members = sources, list[Kernels]()
+        """C++ files that have to compile, and those of them with a module that was imported."""
+        self._tried, self._trying, self._lock = 0, False, threading.RLock()
+        self._why = ""
+
+    def why_missing(self) -> str:
+        """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
+        if self._why or self._tried == len(self.members):
+            return self._why
+        with self._lock:
+            if self._trying:  # what tries them calls them
+                return ""
+            self._trying = True
+            try:
+                count = len(self.members)
+                self._why = self._tried_out()
+                self._tried = count
+            finally:
+                self._trying = False
+        return self._why
+
+    def _tried_out(self) -> str:
+        try:
+            load_native(self.sources[0])
+            with ThreadPoolExecutor(os.cpu_count() or 1) as builders:  # compilers are processes of their own
+                [*builders.map(load_native, self.sources)]
+            wrong = next((each.source.name for each in self.members if not each.agrees), "")
+        except NoCompilerError as error:
+            return str(error)
+        except NativeCodeError as error:
+            why = str(error)
+        else:
+            if not wrong:
+                return ""
+            why = f"what the compiler made of {wrong} does not do what torch does"
+        logger.warning("compiled code is not used, torch computes all, slower and rounded otherwise: %s", why)
+        return why
+
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+@functools.cache
+def _of_package() -> _Together:
+    return _Together(sorted(_PACKAGE.rglob("*.cpp")))
 
 
 class Kernels:
     """Functions of a C++ file that are faster than torch, for a feature that warnings name by ``what``.
 
     What the file declares is what Python calls. ``agree`` tells whether
-    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them.
+    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them. Those of
+    this package are used together or not at all.
     """
 
     def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
         self.what, self.source, self.agree = what, source, agree
+        self._together = _of_package() if _PACKAGE in source.parents else _Together([source])
+        self._together.members.append(self)
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
@@ -264,26 +219,27 @@ class Kernels:
         return library
 
     @functools.cached_property
+    def agrees(self) -> bool:
+        """Whether they do what torch does. Raises NativeCodeError as :attr:`library`."""
+        _ = self.library
+        with torch.inference_mode(False):
+            return self.agree()
+
+    @property
     def why_missing(self) -> str:
         """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
-        try:
-            _ = self.library
-        except NativeCodeError as error:
-            return str(error)
-        with torch.inference_mode(False):
-            agree = self.agree()
-        return "" if agree else f"what the compiler made of {self.source.name} does not do what torch does"
+        return self._together.why_missing()
 
     def usable(self, wanted: bool | None) -> bool:
         """Whether to use them: not if ``wanted`` is False. None means that a machine without a compiler is no reason
         for a warning."""
         if wanted is False:
             return False
-        if self.why_missing and wanted:
+        why = self.why_missing
+        if why and wanted:
             # stacklevel 1: warnings of several kernels with one text are shown once
-            text = f"{self.what} could not be compiled and stays with torch: {self.why_missing}"
-            warnings.warn(text, stacklevel=1)
-        return not self.why_missing
+            warnings.warn(f"{self.what} could not be compiled and stays with torch: {why}", stacklevel=1)
+        return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
         """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for :meth:`usable`."""
