@@ -36,6 +36,7 @@ from pointsplat_ns.pages.stream_page import stream_page
 from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
@@ -232,6 +233,7 @@ def compact(
     return result
 
 
+@normal_mode
 def lod(
     scene: Source,
     levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,

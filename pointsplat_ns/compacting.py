@@ -16,6 +16,7 @@ from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class Goal:
     """Suffix of the format whose size counts."""
 
 
+@normal_mode
 def prune_source(
     scene: Source,
     request: PruneRequest,
@@ -77,6 +79,7 @@ def prune_source(
     return dense, pruned.scene, seconds, quality
 
 
+@normal_mode
 def compact_source(
     scene: Source,
     request: CompactRequest,

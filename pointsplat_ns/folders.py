@@ -26,11 +26,13 @@ from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep, cut_sh
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
+from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.settings import Repair, repairs_of
 from pointsplat_ns.tradeoff.targets import Targets, targets_of
 
 
+@normal_mode
 def compact_folder(
     folder: str | Path,
     output: str | Path | None = None,

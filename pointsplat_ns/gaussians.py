@@ -119,11 +119,13 @@ class Gaussians:
             raise SceneError(f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
 
     @classmethod
-    def empty(cls, sh_degree: int = 0, **kwargs: Any) -> Gaussians:
-        """A scene without Gaussians; ``kwargs`` (dtype, device) go to ``torch.empty``."""
+    def empty(
+        cls, sh_degree: int = 0, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+    ) -> Gaussians:
+        """A scene without Gaussians."""
         rest = (sh_degree + 1) ** 2 - 1
         shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, rest, 3))
-        return cls(*(torch.empty(shape, **kwargs) for shape in shapes))
+        return cls(*(torch.empty(shape, dtype=dtype, device=device) for shape in shapes))
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:

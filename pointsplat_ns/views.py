@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.system.tensors import FLOATS
 
 RasterizeMode = Literal["classic", "antialiased"]
 """The rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
@@ -143,4 +144,4 @@ def spread_indices(length: int, count: int) -> list[int]:
     """At most ``count`` indices below ``length``, evenly spread, with the first and the last."""
     if count >= length:
         return list(range(length))
-    return torch.linspace(0, length - 1, count).round().long().tolist()
+    return torch.linspace(0, length - 1, count, **FLOATS).round().long().tolist()

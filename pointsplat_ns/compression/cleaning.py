@@ -25,6 +25,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -174,18 +175,18 @@ def _views_all_around(scene: Gaussians) -> Views:
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
     places = invert_rigid(sample_views(without_sh, CLEANING.places, seed=CLEANING.seed).viewmats)[:, :3, 3]
     rotations = _six_directions().to(places)
-    viewmats = torch.eye(4).to(places).repeat(len(places), 6, 1, 1)
+    viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
     half = CLEANING.side / 2  # a field of view of 90 degrees
-    K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]])
+    K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], **FLOATS)
     viewmats = viewmats.flatten(0, 1)
-    return Views(viewmats, K.repeat(len(viewmats), 1, 1), CLEANING.side, CLEANING.side, torch.zeros(3))
+    return Views(viewmats, K.repeat(len(viewmats), 1, 1), CLEANING.side, CLEANING.side, torch.zeros(3, **FLOATS))
 
 
 def _six_directions() -> Tensor:
     """World-to-camera rotations (6, 3, 3) of the faces of a cube, OpenCV axes."""
-    forward = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
     right = forward.roll(1, dims=1)
     down = torch.linalg.cross(forward, right)
     return torch.stack([right, down, forward], dim=1)

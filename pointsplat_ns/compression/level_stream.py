@@ -23,6 +23,7 @@ from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.pages.stream_page import StreamPage, page_files
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 @dataclass(frozen=True)
@@ -99,19 +100,20 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
     """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton order; for the arguments
     see :func:`write_stream`."""
     coarsest = levels[-1]
-    ancestors = [torch.arange(len(coarsest))]
+    ancestors = [torch.arange(len(coarsest), **INDICES)]
     for of in reversed(parents):
         ancestors.insert(0, torch.where(of >= 0, ancestors[0][of.clamp_min(0)], -1))
     kept = ancestors[0] >= 0
     weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
     extent = content_size(coarsest)[1] / 8 if chunks.extent is None else chunks.extent
-    leaf_of = torch.empty(len(coarsest), dtype=torch.int64)
+    leaf_of = torch.empty(len(coarsest), **INDICES)
     leaves = 0
 
     def split(members: Tensor) -> tuple | int:  # a leaf's number, or two parts
         nonlocal leaves
         points, weight = coarsest.means[members], weights[members]
-        total, sides = int(weight.sum()), points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3)
+        total = int(weight.sum())
+        sides = points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3, **FLOATS)
         too_wide = float(sides.max()) > extent and total > chunks.least
         if len(members) > 1 and (total > chunks.count or too_wide):
             order = points[:, int(sides.argmax())].argsort(stable=True)
@@ -122,7 +124,7 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
         leaves += 1
         return leaves - 1
 
-    parts = split(torch.arange(len(coarsest)))
+    parts = split(torch.arange(len(coarsest), **INDICES))
     rows = []
     for scene, ancestor in zip(levels, ancestors, strict=True):
         order = morton_order(scene)

@@ -302,7 +302,7 @@ def make_levels(
         notes = (views.text, *notes)
     farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
-    before = torch.arange(len(dense), device=dense.device)  # [N] index in the level before
+    before = torch.arange(len(dense), device=dense.device, dtype=torch.int64)  # [N] index in the level before
     start = time.perf_counter()
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start

@@ -20,6 +20,7 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.pruning.scores import log_volume
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import spread_indices
 
 
@@ -179,7 +180,7 @@ def plot_distributions(scenes: dict[str, Gaussians], path: Path | str) -> None:
     for axis, (values, span, label) in zip(figure.subplots(1, 2), panels, strict=True):
         for name, numbers in values.items():
             counts = torch.histc(numbers.double(), bins=60, min=span[0], max=span[1])
-            edges = torch.linspace(span[0], span[1], 61)
+            edges = torch.linspace(span[0], span[1], 61, **FLOATS)
             axis.stairs(counts.numpy(), edges.numpy(), fill=True, alpha=0.5, label=f"{name}: {len(scenes[name]):,}")
         axis.set_xlabel(label)
         axis.set_ylabel("Gaussians")

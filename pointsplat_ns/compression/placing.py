@@ -16,6 +16,7 @@ from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import axis_named
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 def place(
@@ -57,10 +58,10 @@ def place(
     if directions is not None:
         now, wanted = directions
         matrix = smallest_turn(Sampler(scene).up.direction if now is None else now, wanted)
-        turned = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)).apply(scene)
+        turned = Similarity(matrix, 1.0, torch.zeros(3, **DOUBLES)).apply(scene)
         scene = turned.replace(up=axis_along(wanted))
     if scale != 1.0:
-        scene = Similarity(torch.eye(3, dtype=torch.float64), scale, torch.zeros(3, dtype=torch.float64)).apply(scene)
+        scene = Similarity(torch.eye(3, **DOUBLES), scale, torch.zeros(3, **DOUBLES)).apply(scene)
     return scene
 
 
@@ -79,7 +80,8 @@ def run_frame(run: Run) -> Similarity:
     linear = run.transform[:, :3].double()
     size = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     matrix = linear / size if size > 0 else linear
-    if not size > 0 or float((matrix @ matrix.T - torch.eye(3)).abs().max()) > 1e-4:  # saved with about 7 digits
+    off = (matrix @ matrix.T - torch.eye(3, **FLOATS)).abs().max()
+    if not size > 0 or float(off) > 1e-4:  # saved with about 7 digits
         raise SceneError(
             f"{run.folder}: its transform is not a rotation with one scale; expected the file that nerfstudio saved"
         )

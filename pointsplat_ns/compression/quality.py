@@ -16,6 +16,7 @@ from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import subsampled
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.system.tensors import INDICES
 from pointsplat_ns.views import Views, spread_indices
 
 
@@ -52,7 +53,7 @@ def quality_of(dense: Gaussians, scene: Gaussians, views: Views) -> FullSizeQual
     """
     finish = spread_indices(len(views), MERGING.finish_views)
     if others := sorted({*range(len(views))} - {*finish}):
-        views = views[torch.tensor(others)]
+        views = views[torch.tensor(others, **INDICES)]
     views = views.spread(VIEW_COUNTS.compared)
     psnr, _ = DenseReference(dense, subsampled(views, max(views.width, views.height))).psnr(scene)
     fills = fill(dense, views), fill(scene, views)

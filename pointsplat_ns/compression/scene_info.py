@@ -28,6 +28,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning.duplicates import Copies
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class SceneInfo:
     @property
     def up_text(self) -> str:
         """The direction that is up, named or in numbers, and whether it is a guess; "unknown" if nothing is visible."""
-        return str(Up(torch.tensor(self.up, dtype=torch.float64), not self.up_is_guess)) if self.up else "unknown"
+        return str(Up(torch.tensor(self.up, **DOUBLES), not self.up_is_guess)) if self.up else "unknown"
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as numbers, lists and dictionaries that JSON can hold."""
@@ -156,7 +157,9 @@ def _suspicious(scene: Gaussians, usable: Tensor) -> dict[str, int]:
         "opacity of exactly 0 or 1": int(good.opacities.isinf().sum()),
         "too faint to be drawn": int((good.alphas < ALPHA_MIN).sum()),
         "zero quaternion": int((good.quats.abs().amax(dim=1) < SHORTEST).sum()) if len(good) else 0,
-        "exact copy of another": len(good) - Copies(good, torch.arange(len(good))).distinct if len(good) else 0,
+        "exact copy of another": len(good) - Copies(good, torch.arange(len(good), **INDICES)).distinct
+        if len(good)
+        else 0,
     }
     return {what: count for what, count in counts.items() if count}
 

@@ -7,6 +7,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import DOUBLES
+
 # Normalisation constants of the real spherical harmonics (Sloan, "Efficient Spherical Harmonic
 # Evaluation", 2013), with the signs that 3DGS files use.
 SH_C0 = 0.28209479177387814
@@ -49,7 +51,7 @@ def basis_rows(unit: Tensor, degree: int) -> list[Tensor]:
 def _directions() -> tuple[Tensor, Tensor]:
     """Random unit directions (M, 3), and the basis of degree 3 in them (M, 16), float64."""
     generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, **DOUBLES), dim=1)
     return directions, torch.stack(basis_rows(directions.T, 3), dim=1)
 
 

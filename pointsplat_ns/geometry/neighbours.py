@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import most_threads
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
     n = len(points)
     if n == 0:
-        nothing = torch.empty(0, 0)
+        nothing = torch.empty(0, 0, **FLOATS)
         return nothing.double(), nothing.long()
     array = points.detach().double().cpu().numpy()
     # The ranks are listed, because k = 1 would drop their axis.
@@ -86,7 +87,7 @@ def other_neighbours(points: Tensor, k: int, compiled: bool | None = None) -> Te
         near, walk = tree.others(k), tree.order
     else:
         near, walk = _others_by_scipy(points, k)
-    own = torch.arange(len(points), dtype=torch.int32)
+    own = torch.arange(len(points), dtype=torch.int32, device="cpu")
     same = [
         (last >= 0) & (points[last.long()] == points[these]).all(1)
         for last, these in zip(near[:, k - 1].split(CHUNK), own.split(CHUNK), strict=True)
@@ -105,9 +106,9 @@ def _others_by_scipy(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
     n, array = len(points), points.numpy()
     tree = cKDTree(array, balanced_tree=False)
-    near = torch.full((n, k), -1, dtype=torch.int32)
+    near = torch.full((n, k), -1, dtype=torch.int32, device="cpu")
     ranks = list(range(1, min(k + 1, n) + 1))
-    for these in torch.arange(n).split(TREE.queries_at_once):
+    for these in torch.arange(n, **INDICES).split(TREE.queries_at_once):
         _, found = tree.query(array[these[0] : these[-1] + 1], k=ranks, workers=most_threads())
         indices = torch.from_numpy(found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
@@ -163,7 +164,7 @@ class PointTree:
 
     def __init__(self, points: Tensor):
         count = len(points)
-        self.order = torch.arange(count)
+        self.order = torch.arange(count, **INDICES)
         """Indices (N,) int64 of the points as the leaves hold them."""
         sizes = [-(-count // TREE.lanes)]  # leaves, then the nodes of each level
         while len(sizes) < 2 or sizes[-1] > 1:
@@ -172,8 +173,8 @@ class PointTree:
         self._tree = KERNELS.structs["Tree"](
             points=points.contiguous(), order=self.order, count=count, levels=len(starts),
             starts=(*starts, *[0] * (16 - len(starts))),
-            leaves=torch.empty(sizes[0], 3, TREE.lanes, dtype=torch.float64),
-            boxes=torch.empty(sum(sizes[1:]), 6, TREE.lanes, dtype=torch.float64),
+            leaves=torch.empty(sizes[0], 3, TREE.lanes, **DOUBLES),
+            boxes=torch.empty(sum(sizes[1:]), 6, TREE.lanes, **DOUBLES),
         )  # fmt: skip
         KERNELS.library.pointsplat_order(self._tree)
         self._run(count, KERNELS.library.pointsplat_leaves, self._tree)
@@ -193,11 +194,11 @@ class PointTree:
     def _leaves(self) -> Tensor:
         """The leaf (N,) int64 of each point."""
         leaves = torch.empty_like(self.order)
-        leaves[self.order] = torch.arange(len(self.order)) // TREE.lanes
+        leaves[self.order] = torch.arange(len(self.order), **INDICES) // TREE.lanes
         return leaves
 
     def _search(self, count: int, k: int, **where: Tensor) -> Tensor:
-        found = torch.empty(count, k, dtype=torch.int32)
+        found = torch.empty(count, k, dtype=torch.int32, device="cpu")
         search = KERNELS.structs["Search"](tree=self._tree, count=count, wanted=k, found=found, **where)
         self._run(count, KERNELS.library.pointsplat_nearest, search)
         return found
@@ -210,9 +211,9 @@ class PointTree:
 
 def _as_torch() -> bool:
     """Whether the kernel finds the neighbours of some points as torch does by brute force."""
-    points = torch.randn(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = torch.randn(300, 3, generator=torch.Generator().manual_seed(0), **DOUBLES)
     apart = (points[:, None] - points).square().sum(2).fill_diagonal_(torch.inf)
-    tree, own = PointTree(points), torch.arange(len(points))
+    tree, own = PointTree(points), torch.arange(len(points), **INDICES)
     near = apart.sort(dim=1).indices[:, :5].to(torch.int32)
     return torch.equal(tree.others(5), near) and torch.equal(tree.nearest(points, own, 1)[:, 0].long(), own)
 

@@ -11,13 +11,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import DOUBLES
+
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 """Names of the directions along the axes of the world."""
 
 
 def direction_of(axis: str) -> Tensor:
     """The direction (3,), float64, that one of :data:`AXES` names."""
-    direction = torch.zeros(3, dtype=torch.float64)
+    direction = torch.zeros(3, **DOUBLES)
     direction["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
     return direction
 
@@ -172,10 +174,10 @@ def smallest_turn(start: Tensor, end: Tensor) -> Tensor:
     """The smallest rotation (3, 3) from one direction to another; one of many if they are opposite."""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
-        side = torch.linalg.cross(start, torch.eye(3, dtype=torch.float64)[int(start.abs().argmin())])
+        side = torch.linalg.cross(start, torch.eye(3, **DOUBLES)[int(start.abs().argmin())])
         side = side / side.norm()
-        return 2 * side[:, None] * side[None] - torch.eye(3, dtype=torch.float64)
+        return 2 * side[:, None] * side[None] - torch.eye(3, **DOUBLES)
     cross = torch.linalg.cross(start, end)
     x, y, z = cross.tolist()
-    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
+    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], **DOUBLES)
+    return torch.eye(3, **DOUBLES) + skew + skew @ skew / (1 + cosine)

@@ -22,6 +22,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger, one_line, read_text
 from pointsplat_ns.io.inert_yaml import Tagged, read_config
 from pointsplat_ns.io.splatfacto import is_complete
+from pointsplat_ns.system.tensors import FLOATS
 
 
 @dataclass(frozen=True)
@@ -253,10 +254,10 @@ def read_transforms(path: Path) -> tuple[Tensor, float]:
     """The transform (3, 4) and the scale of a ``dataparser_transforms.json``; the identity and 1 if there is none.
     Raises SceneError if the file is not one."""
     if not path.is_file():
-        return torch.eye(4)[:3], 1.0
+        return torch.eye(4, **FLOATS)[:3], 1.0
     try:
         content = json.loads(read_text(path, 1 << 16))  # nerfstudio writes some hundreds of bytes
-        transform = torch.tensor(content["transform"], dtype=torch.float32)
+        transform = torch.tensor(content["transform"], **FLOATS)
         scale = float(content["scale"])
     except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, RuntimeError) as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)

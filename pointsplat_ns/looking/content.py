@@ -11,6 +11,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 UNITS = 10.0
@@ -58,7 +59,7 @@ def content_size(scene: Gaussians, box: tuple[Tensor, Tensor] | None = None) -> 
     try:
         low, high = content_box(scene) if box is None else box
     except DataError:
-        return torch.zeros(3, dtype=torch.float64), 1.0
+        return torch.zeros(3, **DOUBLES), 1.0
     size = float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax())
     return 0.5 * (low + high).cpu(), size if 0 < size < math.inf else 1.0
 

@@ -11,6 +11,7 @@ from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.system.tensors import INDICES
 from pointsplat_ns.views import Views
 
 
@@ -43,7 +44,7 @@ def coverage(
     """
 
     def views_that_show(views: Views) -> Tensor:  # number (N,) int64 for each Gaussian
-        counts = torch.zeros(len(scene), dtype=torch.int64)
+        counts = torch.zeros(len(scene), **INDICES)
         for pixels in each_view(list(views.resized(side)), len(scene), lambda view: pixels_of(scene, view)):
             counts += pixels >= min_pixels
         return counts

@@ -21,6 +21,7 @@ from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.looking.upright import Up, UprightBox, level_directions
 from pointsplat_ns.looking.whole import around, few_in_units, shown, whole_views
+from pointsplat_ns.system.tensors import FLAGS, INDICES
 from pointsplat_ns.views import Views
 
 
@@ -120,7 +121,7 @@ def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width
     some = settings.gain_points
     pictured = in_pictures(views, surface.points[:some])
     counts = (pictured & visible[:, :some].repeat_interleave(count, dim=0)).sum(1).view(-1, count)
-    best = counts.argmax(1) + count * torch.arange(len(counts))  # one view a place
+    best = counts.argmax(1) + count * torch.arange(len(counts), **INDICES)  # one view a place
     return views[best[counts.amax(1).topk(min(settings.opening_candidates, len(best))).indices]]
 
 
@@ -128,7 +129,7 @@ def _completing(inside: Tensor, count: int) -> list[int]:
     """Indices of views, at most ``count``: first the one that shows the most Gaussians (C, N), then always the one that
     shows most of those that the others do not show."""
     taken: list[int] = []
-    missing = torch.ones(inside.shape[1], dtype=torch.bool)
+    missing = torch.ones(inside.shape[1], **FLAGS)
     while len(taken) < min(count, len(inside)):
         new = (inside & missing).sum(1)
         new[taken] = -1

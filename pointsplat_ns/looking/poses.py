@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -28,13 +29,13 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     ahead = forward.new_tensor([1.0, 0.0, 0.0]).expand_as(forward)
     forward = torch.where(length > 0, forward / length.clamp_min(1e-300), ahead)
     up = forward.new_tensor([0.0, 0.0, 1.0]) if up is None else up.to(forward) / up.to(forward).norm()
-    other = torch.eye(3, dtype=forward.dtype)[int(up.abs().argmin())]
+    other = torch.eye(3, dtype=forward.dtype, device="cpu")[int(up.abs().argmin())]
     steep = (forward @ up).abs() > 0.99
     right = torch.linalg.cross(forward, torch.where(steep[:, None], other, up))
     right = right / right.norm(dim=1, keepdim=True)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], dim=1)  # (C, 3, 3) world to camera
-    viewmats = torch.eye(4, dtype=positions.dtype).repeat(len(positions), 1, 1)
+    viewmats = torch.eye(4, dtype=positions.dtype, device="cpu").repeat(len(positions), 1, 1)
     viewmats[:, :3, :3] = rotation
     viewmats[:, :3, 3] = -(rotation @ positions[..., None])[..., 0]
     return viewmats
@@ -50,9 +51,11 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, setting
         settings: ``field_of_view`` and ``near_plane``.
     """
     focal = 0.5 * max(width, height) / math.tan(math.radians(settings.field_of_view) / 2)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype)
+    K = torch.tensor(
+        [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype, device="cpu"
+    )
     Ks = K.repeat(len(viewmats), 1, 1)
-    return Views(viewmats, Ks, width, height, torch.zeros(3), near_plane=settings.near_plane * diagonal)
+    return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=settings.near_plane * diagonal)
 
 
 def in_pictures(views: Views, points: Tensor, min_depth: float = 0.0) -> Tensor:

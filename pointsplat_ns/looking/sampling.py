@@ -22,6 +22,7 @@ from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, log_widths, photo_places
 from pointsplat_ns.looking.upright import Up, UprightBox, known_up, pointing_up, upright_axis
 from pointsplat_ns.looking.whole import seen_from_above
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -169,7 +170,7 @@ class Sampler:
             search = ViewSearch(fine, widths, self.surface, self.box, *pictures, generator, photos, self.settings)
             return search.views(count)
 
-        near_photos = torch.empty(0, 4, 4, dtype=torch.float64)
+        near_photos = torch.empty(0, 4, 4, **DOUBLES)
         if about_photos and self.photos_in_units is not None:
             near_photos = found(self.inside, self.photos_in_units, int(self.settings.photo_share * count))
         others = found(self.inside, None, count - len(near_photos))
@@ -189,7 +190,7 @@ def unit_direction(up: Tensor) -> Tensor:
     Raises:
         DataError: if it is not a direction.
     """
-    up = torch.as_tensor(up).detach().double().cpu()
+    up = torch.as_tensor(up, **DOUBLES).detach()
     if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
         raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
     return up / up.norm()
@@ -207,7 +208,7 @@ def views_in_scene_units(
 
 def _alternating(first: Tensor, second: Tensor) -> Tensor:
     """Matrices (n, 4, 4) and (m, 4, 4), evenly mixed, (n + m, 4, 4): a few of them contain both kinds."""
-    ranks = torch.cat([(torch.arange(len(some)) + 0.5) / max(1, len(some)) for some in (first, second)])
+    ranks = torch.cat([(torch.arange(len(some), **FLOATS) + 0.5) / max(1, len(some)) for some in (first, second)])
     return torch.cat([first, second])[ranks.argsort(stable=True)]
 
 
@@ -224,7 +225,7 @@ def is_room(surface: Surface, box: UprightBox) -> bool:
     enclosed = enclosure >= settings.min_enclosure
     if float(enclosed.float().mean()) < settings.min_enclosed_places:
         return False
-    outside = torch.randn(settings.places, 3, generator=generator, dtype=torch.float64)
+    outside = torch.randn(settings.places, 3, generator=generator, **DOUBLES)
     outside = outside / outside.norm(dim=1, keepdim=True) * settings.distances[1]
     from_inside, from_outside = (
         float(some.any(0).float().mean()) for some in (visible[enclosed], surface.visible_from(outside)[0])

@@ -19,6 +19,7 @@ from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces, explained_energy
 from pointsplat_ns.looking.upright import UprightBox, level_directions
 from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 
 @dataclass
@@ -50,8 +51,8 @@ class ViewSearch:
     def views(self, count: int) -> Tensor:
         """At most ``count`` world-to-camera matrices (n, 4, 4), float64."""
         settings, points = self.settings, self._points
-        coverage = torch.zeros(len(points.points))
-        values = torch.ones(len(coverage)) if self.photos is None else points.trace_factors
+        coverage = torch.zeros(len(points.points), **FLOATS)
+        values = torch.ones(len(coverage), **FLOATS) if self.photos is None else points.trace_factors
         taken: list[Tensor] = []
         for _ in range(settings.round_factor * math.ceil(count / settings.round_views)):
             viewmats, owner, gains = self._candidates()
@@ -71,7 +72,7 @@ class ViewSearch:
                 break
             if len(taken) < wanted:  # blurred views are better than few places
                 self.max_blur *= settings.blur_growth
-        return torch.stack(taken) if taken else torch.empty(0, 4, 4, dtype=torch.float64)
+        return torch.stack(taken) if taken else torch.empty(0, 4, 4, **DOUBLES)
 
     def _candidates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Candidate views (V, 4, 4), the index (V,) of the place of each, and its gain (V, P) at each point."""
@@ -95,7 +96,7 @@ class ViewSearch:
             enclosed = enclosure >= settings.min_enclosure
             places, visible = places[enclosed], visible[enclosed]
         turns = settings.turns_inside if inside else settings.turns_outside
-        owner = torch.arange(len(places)).repeat_interleave(turns)
+        owner = torch.arange(len(places), **INDICES).repeat_interleave(turns)
         eyes = places[owner]
         targets = self._ahead(eyes) if inside else self._at_content(visible[owner])
         viewmats = look_at(eyes, targets, self.box.up)
@@ -108,20 +109,20 @@ class ViewSearch:
         settings, points = self.settings, self._points
         count = settings.draws * settings.places
         drawn = torch.multinomial(photos.shares.float(), count, replacement=True, generator=self.generator)
-        offsets = torch.randn(len(drawn), 3, generator=self.generator).double()
+        offsets = torch.randn(len(drawn), 3, generator=self.generator, **FLOATS).double()
         places = photos.places[drawn] + settings.photo_place_deviation * offsets
         if self.inside:
             places = torch.cat([places, self.box.places_at_eyes(self.generator, self.settings)[:count]])
         places = places[self.surface.clearance(places) > settings.min_clearance_photos]
         visible = self.surface.visible_from(places)[0][:, : settings.gain_points]
-        evidence = torch.ones(visible.shape)  # relative to the smallest of a photo place
+        evidence = torch.ones(visible.shape, **FLOATS)  # relative to the smallest of a photo place
         if bool(points.sh.any()):
             for row, place in zip(evidence, places, strict=True):
                 row.copy_(explained_energy(points.points - place, points.sh, settings) / settings.min_sh_evidence)
         means = (visible * evidence).sum(1) / visible.sum(1).clamp_min(1)
         best = means.topk(min(count, len(places))).indices
         places, visible, evidence = places[best], visible[best], evidence[best]
-        owner = torch.arange(len(places)).repeat_interleave(settings.turns_inside)
+        owner = torch.arange(len(places), **INDICES).repeat_interleave(settings.turns_inside)
         values = visible * points.trace_factors * evidence
         chances = (values + 1e-12)[owner]
         target = torch.multinomial(chances, 1, generator=self.generator)[:, 0] if len(owner) else owner
@@ -131,7 +132,7 @@ class ViewSearch:
     def _outside(self) -> Tensor:
         """Places (P, 3) around the content."""
         settings, up = self.settings, self.box.up
-        turn, lift, far = torch.rand(3, settings.draws * settings.places, generator=self.generator, dtype=torch.float64)
+        turn, lift, far = torch.rand(3, settings.draws * settings.places, generator=self.generator, **DOUBLES)
         low, high = (math.sin(math.radians(angle)) for angle in settings.elevations)
         lift = low + (high - low) * lift
         level = (1 - lift.square()).sqrt()[:, None] * level_directions(up, 2 * math.pi * turn)
@@ -142,9 +143,9 @@ class ViewSearch:
         """Targets (V, 3) of cameras at ``eyes`` (V, 3) in a room, turned evenly at each place."""
         settings, up = self.settings, self.box.up
         turns = settings.turns_inside
-        first = torch.rand(len(eyes) // turns, generator=self.generator, dtype=torch.float64)
-        turn = 2 * math.pi * (first[:, None] + torch.arange(turns) / turns).reshape(-1)
-        normal = torch.randn(len(eyes), generator=self.generator, dtype=torch.float64)
+        first = torch.rand(len(eyes) // turns, generator=self.generator, **DOUBLES)
+        turn = 2 * math.pi * (first[:, None] + torch.arange(turns, **FLOATS) / turns).reshape(-1)
+        normal = torch.randn(len(eyes), generator=self.generator, **DOUBLES)
         pitch = torch.deg2rad(settings.pitch_mean + settings.pitch_deviation * normal)
         return eyes + pitch.cos()[:, None] * level_directions(up, turn) + pitch.sin()[:, None] * up
 
@@ -152,10 +153,10 @@ class ViewSearch:
         """Targets (V, 3), each between the centre of the content and a point of it that is ``visible`` (V, M)."""
         near = self.surface.points.norm(dim=1) < self.settings.content_radius
         chances = (visible & near).float() + 1e-9
-        drawn = torch.empty(0, dtype=torch.int64)
+        drawn = torch.empty(0, **INDICES)
         if len(visible):
             drawn = torch.multinomial(chances, 1, generator=self.generator)[:, 0]
-        share = torch.rand(len(visible), 1, generator=self.generator, dtype=torch.float64)
+        share = torch.rand(len(visible), 1, generator=self.generator, **DOUBLES)
         return self.settings.target_share * share * self.surface.points[drawn]
 
     def _gains(self, viewmats: Tensor, visible: Tensor) -> Tensor:
@@ -163,7 +164,7 @@ class ViewSearch:
         and of a small Gaussian, 0 outside of the picture and for points that are not ``visible`` (V, P)."""
         settings, points = self.settings, self._points
         x, y, z = (viewmats[:, :3, :3].float() @ points.points.float().T + viewmats[:, :3, 3:].float()).unbind(1)
-        edge = math.tan(math.radians(settings.field_of_view) / 2) * torch.tensor([self.width, self.height])
+        edge = math.tan(math.radians(settings.field_of_view) / 2) * torch.tensor([self.width, self.height], **FLOATS)
         edge = edge / max(self.width, self.height)
         aside = torch.maximum(x.abs() / edge[0], y.abs() / edge[1]) / z.clamp_min(1e-6)
         in_picture = visible & (z > 0) & (aside < 1)

@@ -18,6 +18,7 @@ from pointsplat_ns.geometry.transforms import curve_keys, rotation_matrices, uni
 from pointsplat_ns.looking.content import UNITS, positions_in_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.traces import trace_factors, unit_sh
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +46,18 @@ class Surface:
         generator = torch.Generator().manual_seed(0)
         cumulative = _chances(scene, settings).cpu().cumsum(0)
         count = settings.surface_points
-        drawn = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
+        drawn = torch.rand(count, generator=generator, **DOUBLES) * cumulative[-1]
         some = scene[torch.searchsorted(cumulative, drawn).clamp_max(len(scene) - 1).to(scene.device)].to("cpu")
         # exp(scale) may be infinite; a point that far away is as good as one at a million times the content's size.
         stds, order = (some.stds.double() * (UNITS / size)).clamp_max(1e6 * UNITS).sort(dim=1)
         axes = rotation_matrices(some.quats.double())  # columns are the axes
         axes = axes.gather(2, order[:, None, :].expand(-1, 3, 3))
-        offsets = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+        offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
         offsets = offsets.clamp(-settings.max_surface_offset, settings.max_surface_offset) * stds
         points = positions_in_units(some.means, centre.cpu(), size) + (axes @ offsets[..., None])[..., 0]
         flatness = 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300)
         along = curve_keys(unit_cells(some.means)).argsort(stable=True)
-        factors = torch.empty(count)
+        factors = torch.empty(count, **FLOATS)
         factors[along] = trace_factors(some, along, settings)
         widths = (stds[:, 1] * stds[:, 2]).sqrt().float()
         sh = unit_sh(some.features_rest, settings)
@@ -94,7 +95,9 @@ class Surface:
         row = ((offsets[..., 2] / distances + 1) * (rows / 2)).long().clamp(0, rows - 1)
         turn = torch.atan2(offsets[..., 1], offsets[..., 0]) * (columns / (2 * math.pi))
         cell = row * columns + turn.floor().long().remainder(columns)
-        nearest = torch.full((len(places), rows * columns), math.inf).scatter_reduce_(1, cell, distances, "amin")
+        nearest = torch.full((len(places), rows * columns), math.inf, **FLOATS).scatter_reduce_(
+            1, cell, distances, "amin"
+        )
         farthest = nearest.gather(1, cell) * (1 + self.settings.relative_depth_tolerance)
         visible = distances <= farthest + self.settings.depth_tolerance
         enclosed = nearest.isfinite().view(-1, rows // 2, 2, columns // 2, 2).amax((2, 4))

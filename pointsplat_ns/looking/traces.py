@@ -28,6 +28,7 @@ from pointsplat_ns.looking.content import positions_in_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
+from pointsplat_ns.system.tensors import FLOATS
 
 
 class PhotoPlaces(NamedTuple):
@@ -97,7 +98,7 @@ class PhotoEvidence:
     def of(scene: Gaussians, generator: torch.Generator, settings: LookingSettings = LOOKING) -> PhotoEvidence:
         """Gaussians that are drawn from those with SH; if there are none, from all that are opaque enough."""
         count = settings.evidence_count
-        drawn = torch.randperm(len(scene), generator=generator)[: settings.evidence_draws * count]
+        drawn = torch.randperm(len(scene), generator=generator, device="cpu")[: settings.evidence_draws * count]
         some = scene[drawn.to(scene.device)].to("cpu")
         sh = unit_sh(some.features_rest, settings)
         opaque = some.usable() & (some.alphas > settings.min_opacity)
@@ -116,7 +117,7 @@ class PhotoEvidence:
     def candidates(self, count: int, generator: torch.Generator) -> Tensor:
         """Candidate places (count, 3), drawn evenly from a box around the Gaussians, float64."""
         low, high = torch.quantile(self.means, self.means.new_tensor(self.settings.outlier_quantiles), dim=0)
-        offsets = torch.rand(count, 3, generator=generator).double() - 0.5
+        offsets = torch.rand(count, 3, generator=generator, **FLOATS).double() - 0.5
         return 0.5 * (low + high) + self.settings.place_box_factor * (high - low) * offsets
 
     def at(self, places: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ class UprightBox:
         points along each axis."""
         points = _content(surface).points
         yaw_step = math.radians(surface.settings.box_yaw_step)
-        turn = torch.arange(0, math.pi / 2, yaw_step, dtype=torch.float64)
+        turn = torch.arange(0, math.pi / 2, yaw_step, **DOUBLES)
         right, ahead = level_directions(up, turn), level_directions(up, turn + math.pi / 2)
         frames = torch.stack([right, ahead, up.expand_as(right)], dim=1)  # [T, 3, 3]
         along = frames @ points.T
@@ -98,7 +99,7 @@ class UprightBox:
     def places(self, count: int, generator: torch.Generator) -> Tensor:
         """Positions (count, 3), units, drawn evenly from the box."""
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
-        share = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
+        share = 2 * torch.rand(count, 3, generator=generator, **DOUBLES) - 1
         return (middle + share * half) @ self.frame
 
     def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = LOOKING) -> Tensor:
@@ -121,7 +122,7 @@ def level_directions(up: Tensor, turn: Tensor) -> Tensor:
 
 def _across(axes: Tensor) -> Tensor:
     """A direction at a right angle to each axis (..., 3)."""
-    right = torch.linalg.cross(axes, torch.eye(3, dtype=axes.dtype)[axes.abs().argmin(-1)])
+    right = torch.linalg.cross(axes, torch.eye(3, dtype=axes.dtype, device="cpu")[axes.abs().argmin(-1)])
     return right / right.norm(dim=-1, keepdim=True)
 
 
@@ -141,7 +142,7 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
         scores = uprightness(axes, content)
         return scores if photos is None else scores + settings.photo_level_weight * levelness(axes, photos)
 
-    index = torch.arange(settings.upright_directions, dtype=torch.float64) + 0.5
+    index = torch.arange(settings.upright_directions, **DOUBLES) + 0.5
     height = 1 - index / settings.upright_directions  # Fibonacci's spiral
     turn = index * math.pi * (3 - math.sqrt(5))
     ring = (1 - height.square()).sqrt()
@@ -153,7 +154,7 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
         scores = scores_of(found)
         found = found[scores.topk(settings.refined_directions).indices]
     of_world, of_y = settings.usual_axis_factors if photos is None else (1.05, 1.0)
-    world = torch.eye(3, dtype=torch.float64)
+    world = torch.eye(3, **DOUBLES)
     world_scores = world.new_tensor([of_world, of_world * of_y, of_world]) * scores_of(world)
     return world[world_scores.argmax()] if bool(world_scores.max() >= scores.max()) else found[0]
 
@@ -199,7 +200,7 @@ def levelness(axes: Tensor, photos: PhotoPlaces) -> Tensor:
     spread = offsets.T @ (shares[:, None] * offsets)
     widest = torch.linalg.eigvalsh(spread)[-1]
     if float(widest) <= 0:
-        return torch.zeros(len(axes), dtype=torch.float64)
+        return torch.zeros(len(axes), **DOUBLES)
     along = (axes @ spread * axes).sum(1).clamp_min(0)
     return 1 - (along / widest).clamp_max(1).sqrt()
 
@@ -214,12 +215,12 @@ def uprightness(axes: Tensor, content: Surface) -> Tensor:
     weights = content.flatness / content.flatness.sum().clamp_min(1e-300)
     tilt = torch.rad2deg(torch.asin((axes @ content.normals.T).abs().clamp_max(1)))  # [D, n] 90 where level
     level, vertical = ((-0.5 * (angle / deviation).square()).exp() for angle in (90 - tilt, tilt))
-    even = torch.rad2deg(torch.asin((torch.arange(1000, dtype=torch.float64) + 0.5) / 1000))
+    even = torch.rad2deg(torch.asin((torch.arange(1000, **DOUBLES) + 0.5) / 1000))
     chance = sum(float((-0.5 * (angle / deviation).square()).exp().mean()) for angle in (90 - even, even))
     thickness = content.settings.slab_thickness
     slabs = round(2 * radius / thickness)
     slab = ((axes @ content.points.T + radius) / thickness).long().clamp(0, slabs - 1)
-    counts = torch.zeros(len(axes), slabs, dtype=torch.float64)
+    counts = torch.zeros(len(axes), slabs, **DOUBLES)
     counts.scatter_add_(1, slab, torch.ones_like(slab, dtype=torch.float64))
     thickest = (counts[:, 1:] + counts[:, :-1]).amax(1) / len(content.points)
     return (level + vertical) @ weights - chance * float(weights.sum()) + thickest

@@ -17,6 +17,7 @@ from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.system.tensors import FLAGS, FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -68,7 +69,7 @@ def shown(few: Gaussians, views: Views, side: int) -> Tensor:
         side: longer side of the pictures, pixels.
     """
     rows = [pixels_of(few, view) > LOOKING.min_shown_pixels for view in views.resized(side)]
-    return torch.stack(rows) if rows else torch.zeros(0, len(few), dtype=torch.bool)
+    return torch.stack(rows) if rows else torch.zeros(0, len(few), **FLAGS)
 
 
 def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: Surface, axis: Tensor) -> float:
@@ -94,4 +95,4 @@ def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: 
 
 def around(count: int) -> Tensor:
     """Angles (count,) all around, radians."""
-    return torch.arange(count) * (2 * math.pi / count)
+    return torch.arange(count, **FLOATS) * (2 * math.pi / count)

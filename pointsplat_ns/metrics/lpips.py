@@ -25,6 +25,7 @@ from torch.func import functional_call
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import ImageError, as_nchw, per_image
+from pointsplat_ns.system.tensors import FLOATS
 
 Net = Literal["alex", "vgg"]
 
@@ -88,8 +89,8 @@ class Lpips(nn.Module):
         self.net = net
         self._backbone = _BACKBONES[net]
         # Mean and standard deviation of ImageNet, in units of [-1, 1], as LPIPS was fitted with.
-        self._freeze(self, "shift", torch.tensor([-0.030, -0.088, -0.188]).reshape(1, 3, 1, 1))
-        self._freeze(self, "spread", torch.tensor([0.458, 0.448, 0.450]).reshape(1, 3, 1, 1))
+        self._freeze(self, "shift", torch.tensor([-0.030, -0.088, -0.188], **FLOATS).reshape(1, 3, 1, 1))
+        self._freeze(self, "spread", torch.tensor([0.458, 0.448, 0.450], **FLOATS).reshape(1, 3, 1, 1))
         self.features = empty_features(net)
         for index, layer in self.features.named_children():
             for name, parameter in list(layer.named_parameters()):

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
@@ -97,7 +98,7 @@ class CompiledSimilarity(torch.autograd.Function):
         ctx.shape, ctx.interleaved = (planes, height, row, step, math.ceil(rows / 48)), interleaved  # rows of a band
         ctx.count = planes * rows * windows
         partials = image.new_empty(3, planes, rows, windows) if ctx.needs_input_grad[0] else None
-        sums = torch.empty(planes * ctx.shape[-1], dtype=torch.float64)
+        sums = torch.empty(planes * ctx.shape[-1], **DOUBLES)
         _call(image, other, ctx.shape, partials, sums=sums)
         ctx.save_for_backward(image, other, partials)
         return (sums.sum() / ctx.count).float()
@@ -131,7 +132,7 @@ def _call(
 def _as_torch() -> bool:
     """Whether the kernel gives the similarity of some images and its gradient as torch does."""
     generator = torch.Generator().manual_seed(0)
-    image, noise = (torch.rand(1, 70, 59, 3, generator=generator) for _ in range(2))
+    image, noise = (torch.rand(1, 70, 59, 3, generator=generator, **FLOATS) for _ in range(2))
     found = []
     for function in (CompiledSimilarity.apply, functools.partial(mean_ssim, compiled=False)):
         with torch.enable_grad():

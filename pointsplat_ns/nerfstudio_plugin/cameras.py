@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
 
 
@@ -22,7 +23,7 @@ def cameras_of_views(views: Views) -> Cameras:
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     carried = {"near_plane": views.near_plane, "eps2d": views.eps2d}
-    metadata = {name: torch.full((len(views), 1), value, dtype=torch.float64) for name, value in carried.items()}
+    metadata = {name: torch.full((len(views), 1), value, **DOUBLES) for name, value in carried.items()}
     kind = CameraType.PERSPECTIVE
     return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata)
 

@@ -20,6 +20,7 @@ from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, training_photos
 from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
@@ -29,6 +30,7 @@ from pointsplat_ns.tradeoff.targets import TargetSearch, targets_of
 from pointsplat_ns.views import Views
 
 
+@normal_mode
 def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,

@@ -17,6 +17,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.io.files import read_text
+from pointsplat_ns.system.tensors import INDICES
 
 
 @dataclass
@@ -81,7 +82,7 @@ class SeededScanNetpp(ScanNetpp):
         outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
         if outputs.mask_filenames is not None:
             outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
-        outputs.cameras = outputs.cameras[torch.tensor(kept)]
+        outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
         return outputs
 
     def _seed_points(self, frames: dict[str, dict[str, Any]], outputs: DataparserOutputs) -> dict[str, Tensor]:

@@ -21,6 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 class UndistortedDataset(InputDataset):
@@ -75,14 +76,16 @@ class UndistortedDataset(InputDataset):
         distortion = [] if cameras.distortion_params is None else [cameras.distortion_params]
         every = torch.cat([part.double() for part in (*scalars, *distortion)], dim=1)
         kinds, kind_of = every.unique(dim=0, return_inverse=True)
-        pinholes = torch.empty(len(kinds), 6, dtype=torch.float64)
+        pinholes = torch.empty(len(kinds), 6, **DOUBLES)
         for kind in range(len(kinds)):
             first = int((kind_of == kind).nonzero()[0, 0])
             if lenses[first]:
                 width, height = int(cameras.width[first]), int(cameras.height[first])
                 nothing = np.zeros((height, width), np.uint8)
                 K, image, _ = _undistorted(cameras[first : first + 1], self.image_filenames[first], nothing, {})
-                pinholes[kind] = torch.tensor([K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0]])
+                pinholes[kind] = torch.tensor(
+                    [K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0]], **DOUBLES
+                )
             else:
                 pinholes[kind] = every[first, :6]
         fx, fy, cx, cy, width, height = pinholes[kind_of].split(1, dim=1)

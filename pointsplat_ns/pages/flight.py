@@ -24,6 +24,7 @@ from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")
@@ -101,7 +102,7 @@ def _up_of(views: Views, estimated: Up) -> Up:
     """The direction nearest to the mean up direction of cameras, which people hold upright: the estimated one, a world
     axis, or the opposite of one of them. Cameras that are exactly level were made for the estimated direction."""
     viewmats = views.viewmats.double().cpu()
-    axes = torch.cat([estimated.direction.cpu()[None], torch.eye(3, dtype=torch.float64)])
+    axes = torch.cat([estimated.direction.cpu()[None], torch.eye(3, **DOUBLES)])
     axes = torch.cat([axes, -axes])
     up = axes[(axes @ -viewmats[:, 1, :3].mean(0)).argmax()]
     return Up(up, estimated.sure or float((viewmats[:, 0, :3] @ up).abs().max()) > 1e-6)

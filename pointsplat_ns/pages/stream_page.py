@@ -24,6 +24,7 @@ from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.pages.flight import FlightFrame, eyes_of
 from pointsplat_ns.pages.web_viewer import WebViewer, WebViewerPackage, known_digests
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 
@@ -55,10 +56,10 @@ def stream_page(viewer: WebViewer, scene: Gaussians, known: Views | None, up: Up
         PointSplatError: if the viewer's page is another than expected.
     """
     frame = FlightFrame.of(scene, known, up)
-    wanted = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    wanted = torch.tensor([0.0, -1.0, 0.0], **DOUBLES)
     matrix = smallest_turn(frame.up.direction.double(), wanted)
     turned = float((frame.up.direction - wanted).abs().max()) > 1e-6
-    turn = Similarity(matrix, 1.0, torch.zeros(3, dtype=torch.float64)) if turned else None
+    turn = Similarity(matrix, 1.0, torch.zeros(3, **DOUBLES)) if turned else None
     bootstrap = {"generator": "pointsplat-ns", "contentUrl": f"./{STREAM_META}", "settings": _settings(frame, turn)}
     named = str(frame.up).replace("(a guess)", "(a guess; --up names another axis)")
     note = f"the page: up is {named}" + (", turned to -y as viewers show it" if turned else "")

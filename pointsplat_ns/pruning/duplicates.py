@@ -15,6 +15,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import FLAGS, INDICES
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Copies:
     def __init__(self, scene: Gaussians, members: Tensor):
         self.scene, self.members = scene, members
         self.first = _first_equal(scene, members)  # [n] index in ``members`` of the first that each equals
-        self.distinct = int((self.first == torch.arange(len(members))).sum())
+        self.distinct = int((self.first == torch.arange(len(members), **INDICES)).sum())
         """Number of different members."""
 
     def __len__(self) -> int:
@@ -49,8 +50,8 @@ class Copies:
         n = len(self)
         if k == n:
             return Reduced(self.scene, self.members, None)
-        index, rank = torch.arange(len(self.scene)), _ranks(self.first)
-        removed = torch.ones(n, dtype=torch.bool)
+        index, rank = torch.arange(len(self.scene), **INDICES), _ranks(self.first)
+        removed = torch.ones(n, **FLAGS)
         removed[rank.sort(stable=True).indices[:k]] = False
         counts = torch.bincount(self.first[removed], minlength=n) + 1
         changed = (counts > 1).nonzero()[:, 0]
@@ -59,7 +60,7 @@ class Copies:
         alphas, growth = stacked(torch.sigmoid(opacities[rows, 0].double()), counts[changed])
         opacities[rows, 0] = torch.logit(alphas).to(opacities.dtype)
         scales[rows] = (scales[rows].double() + growth[:, None]).to(scales.dtype)
-        kept = torch.ones(len(self.scene), dtype=torch.bool)
+        kept = torch.ones(len(self.scene), **FLAGS)
         kept[self.members[removed]] = False
         index[self.members[removed]] = self.members[self.first[removed]]
         place = kept.cumsum(0) - 1
@@ -106,17 +107,17 @@ def _first_equal(scene: Gaussians, members: Tensor) -> Tensor:
     the same hash. If two different members share that hash as well, copies of the second are not found.
     """
     n = len(members)
-    first = torch.arange(n)
+    first = torch.arange(n, **INDICES)
     some = _repeated(_hashes([scene.means], members))
     if len(some) == 0:
         return first
     parameters = [value.flatten(1) for value in scene.tensors()]
     hashes = _hashes(parameters, members[some])
     _, kind = hashes.unique(return_inverse=True)
-    leader = torch.full((len(some),), n).scatter_reduce_(0, kind, some, "amin")[kind]  # [len(some)] index in members
-    same = torch.ones(len(some), dtype=torch.bool)
+    leader = torch.full((len(some),), n, **INDICES).scatter_reduce_(0, kind, some, "amin")[kind]  # index in members
+    same = torch.ones(len(some), **FLAGS)
     for value in parameters:
-        for these in torch.arange(len(some)).split(CHUNK):
+        for these in torch.arange(len(some), **INDICES).split(CHUNK):
             same[these] &= (value[members[some[these]]] == value[members[leader[these]]]).all(1)
     first[some[same]] = leader[same]
     return first
@@ -124,7 +125,7 @@ def _first_equal(scene: Gaussians, members: Tensor) -> Tensor:
 
 def _hashes(columns: list[Tensor], rows: Tensor) -> Tensor:
     """Hashes (m,) int64 of rows (m,) of tensors (N, D): of their bits, modulo 2^64."""
-    result = torch.zeros(len(rows), dtype=torch.int64)
+    result = torch.zeros(len(rows), **INDICES)
     integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}
     for values in columns:
         for column in values.view(integers[values.element_size()]).unbind(1):
@@ -136,7 +137,7 @@ def _repeated(keys: Tensor) -> Tensor:
     """Ascending indices of the keys (n,) that occur more than once."""
     ranked, order = keys.sort()
     same = ranked[1:] == ranked[:-1]
-    twice = torch.zeros(len(keys), dtype=torch.bool)
+    twice = torch.zeros(len(keys), **FLAGS)
     twice[order[1:][same]] = True
     twice[order[:-1][same]] = True
     return twice.nonzero()[:, 0]
@@ -147,5 +148,5 @@ def _ranks(kind: Tensor) -> Tensor:
     ranked, order = kind.sort(stable=True)
     starts = torch.searchsorted(ranked, ranked)
     ranks = torch.empty_like(kind)
-    ranks[order] = torch.arange(len(kind)) - starts
+    ranks[order] = torch.arange(len(kind), **INDICES) - starts
     return ranks

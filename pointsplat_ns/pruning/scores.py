@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.system.tensors import DOUBLES
 
 DEFAULT_OPACITY_WEIGHT = 0.3
 """Lambda of the paper's eq. 3, which uses the same value for every data set."""
@@ -121,7 +122,7 @@ def area_score(scene: Gaussians) -> Tensor:
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:
     """Uniform in [0, 1), the same for a seed on every device, (N,) float64: a baseline."""
     generator = torch.Generator().manual_seed(seed)
-    return _only_usable(scene, torch.rand(len(scene), generator=generator, dtype=torch.float64).to(scene.device))
+    return _only_usable(scene, torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device))
 
 
 def _only_usable(scene: Gaussians, scores: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from pointsplat_ns.pruning.scores import ScoreError, log_volume
 from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, drawn_antialiased, project
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -128,7 +129,7 @@ def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
-    unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1]).to(blocks))
+    unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1], **FLOATS).to(blocks))
     values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
     result = values.clamp_min(least).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)

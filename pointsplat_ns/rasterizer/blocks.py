@@ -150,7 +150,7 @@ def differentiate_region(
 
     # group the sums of pairs by Gaussian; pairs behind a saturated tile have no sum
     by_place = place.new_full((frame.pairs_count + 1,), total)
-    by_place.index_copy_(0, place, torch.arange(total, device=place.device))
+    by_place.index_copy_(0, place, torch.arange(total, device=place.device, dtype=torch.int64))
     by_gaussian = torch.empty_like(tiles.places).index_copy_(0, tiles.places, by_place[:-1])
     in_depth_order = F.embedding_bag(by_gaussian, sums, torch.cumsum(tiles.counts, 0) - tiles.counts, mode="sum")
     return torch.empty_like(in_depth_order).index_copy_(0, tiles.order, in_depth_order)

@@ -41,7 +41,7 @@ def sh_to_color(
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
     if ids is None:
-        ids = torch.arange(first.shape[0], device=first.device)
+        ids = torch.arange(first.shape[0], device=first.device, dtype=torch.int64)
     if compiled_colors.KERNELS.usable_for(compiled, directions, first, *([] if rest is None else [rest])):
         # a constant has no direction
         return compiled_colors.CompiledColor.apply(

@@ -114,8 +114,9 @@ def _strips(ellipses: Ellipses, grid: Grid, region: Region) -> tuple[Tensor, Ten
     owner, row = _expand((row1 - row0 + 1).clamp_min_(0))
     row += row0.index_select(0, owner)
     mx, my, level, inverse_yy, peak, slope, variance = ellipses.shapes.index_select(0, owner).unbind(-1)
-    top = row * TILE + (0.5 - SLACK) - my
-    bottom = (row * TILE + (TILE - 0.5)).clamp_(max=grid.height - 0.5) + SLACK - my
+    first = row.to(my.dtype) * TILE
+    top = first + (0.5 - SLACK) - my
+    bottom = (first + (TILE - 0.5)).clamp_(max=grid.height - 0.5) + SLACK - my
 
     def edge(dy: Tensor, sign: float) -> Tensor:
         dy = torch.minimum(torch.maximum(dy, top), bottom)
@@ -131,7 +132,7 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
     """For ``counts`` (M,): the owner of each of ``sum(counts)`` items and its place with that owner."""
     owner = torch.repeat_interleave(counts)
     starts = torch.cumsum(counts, 0) - counts
-    place = torch.arange(owner.numel(), device=counts.device)
+    place = torch.arange(owner.numel(), device=counts.device, dtype=torch.int64)
     return owner, place.sub_(starts.index_select(0, owner))
 
 

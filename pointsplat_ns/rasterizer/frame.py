@@ -81,14 +81,14 @@ class Frame:
 
     def inside(self, tiles: Tiles) -> Tensor:
         """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""
-        axis = torch.arange(TILE, device=tiles.x.device) - (TILE // 2)
+        axis = torch.arange(TILE, device=tiles.x.device, dtype=torch.int64) - (TILE // 2)
         columns = tiles.x[:, None] + axis < self.width
         rows = tiles.y[:, None] + axis < self.height
         return (rows[:, :, None] & columns[:, None, :]).view(-1, PIXELS).to(tiles.x.dtype)
 
     def pairs(self, tiles: Tiles, first: int, size: int) -> Tensor:
         """Places in the pair list of S Gaussians for each tile, (B * S,); one past all pairs where a list has ended."""
-        place = tiles.start[:, None] + torch.arange(first, first + size, device=tiles.start.device)
+        place = tiles.start[:, None] + torch.arange(first, first + size, device=tiles.start.device, dtype=torch.int64)
         return place.masked_fill_(place >= tiles.end[:, None], self.pairs_count).view(-1)
 
 

@@ -25,6 +25,7 @@ from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.rasterizer.rendering import Colors, rasterization
 from pointsplat_ns.rasterizer.tiles import Region
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 
 Camera = tuple[Tensor, Tensor, Lens]
@@ -53,11 +54,14 @@ def _placed(
         tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
     channels, ranges, whole = (3 if colored else 0), -(-count // library.pointsplat_range()), _whole(camera[2])
-    table, depths = torch.empty(count, 6 + channels), torch.empty(count, dtype=torch.float64)
-    ids, boxes = torch.empty(count, dtype=torch.int32), torch.empty(count, 4, dtype=torch.int32)
-    counts, heights = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.int64)
-    nearest = torch.empty(ranges, dtype=torch.float64)
-    offsets = torch.zeros(whole.rows * whole.columns + 1, dtype=torch.int64)
+    table, depths = torch.empty(count, 6 + channels, **FLOATS), torch.empty(count, **DOUBLES)
+    ids, boxes = (
+        torch.empty(count, dtype=torch.int32, device="cpu"),
+        torch.empty(count, 4, dtype=torch.int32, device="cpu"),
+    )
+    counts, heights = torch.empty(ranges, **INDICES), torch.empty(ranges, **INDICES)
+    nearest = torch.empty(ranges, **DOUBLES)
+    offsets = torch.zeros(whole.rows * whole.columns + 1, **INDICES)
     inputs = KernelInputs(table, channels, quality)
     task = KERNELS.structs["Placing"](
         camera=camera_struct(KERNELS, *camera), scene=scene_struct(KERNELS, *tensors),
@@ -69,14 +73,14 @@ def _placed(
     )  # fmt: skip
     on_threads(count >= SEVERAL, library.pointsplat_place, task)
     drawn = int(counts.sum())
-    order, strips = torch.empty(drawn, dtype=torch.int64), torch.empty(int(heights.sum()), 2, dtype=torch.int32)
+    order, strips = torch.empty(drawn, **INDICES), torch.empty(int(heights.sum()), 2, dtype=torch.int32, device="cpu")
     task.fill(order=order, strips=strips)
     library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
     if total > most_pairs:
         return None
-    pairs = torch.empty(total, dtype=torch.int64)
+    pairs = torch.empty(total, **INDICES)
     task.fill(offsets=offsets, pairs=pairs)
     library.pointsplat_list(task, drawn, offsets[:-1].clone())
     return inputs, pairs, offsets
@@ -95,7 +99,7 @@ def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int)
         return None
     (inputs, pairs, offsets), lens = found, camera[2]
     whole, count = _whole(lens), offsets.numel() - 1
-    image, final = torch.empty(count, 3, PIXELS), torch.empty(count, PIXELS)
+    image, final = torch.empty(count, 3, PIXELS, **FLOATS), torch.empty(count, PIXELS, **FLOATS)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
     on_threads(pairs.numel() >= SEVERAL, blending.KERNELS.library.pointsplat_blend, task)
@@ -126,13 +130,13 @@ def _as_torch() -> bool:
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
+        return torch.randn(*shape, generator=generator, **FLOATS)
 
     count, width, height = 90, 43, 38
-    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0])
+    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0], **FLOATS)
     sh = random(count, 3), 0.3 * random(count, 15, 3)
     scene = Gaussians(means, 0.8 * random(count, 3) - 1.5, random(count, 4), random(count, 1), *sh)
-    viewmat, K = torch.eye(4), torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]])
+    viewmat, K = torch.eye(4, **FLOATS), torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]], **FLOATS)
     camera = camera_of(viewmat, K, width, height, 0.01, math.inf, 0.0, 0.3, True)
 
     def by_torch(colors: Colors, sh_degree: int | None) -> tuple[Tensor, Tensor]:
@@ -146,7 +150,7 @@ def _as_torch() -> bool:
         image, alpha = by_torch(sh, 3)
         drawn, weighed = picture(scene, camera, Quality(), 10**6), weights(scene, camera, Quality(), 10**6)
     with torch.enable_grad():
-        flat = torch.zeros(count, 1, requires_grad=True)
+        flat = torch.zeros(count, 1, requires_grad=True, **FLOATS)
         (pixels,) = torch.autograd.grad(by_torch(flat, None)[0].sum(), flat)
     if drawn is None or weighed is None:
         return False

@@ -66,7 +66,7 @@ def sum_over_pixels(
     table = torch.stack(shapes, dim=-1)  # (M, 6)
     lengths, order = torch.sort(starts.diff(), descending=True)
     occupied = int((lengths > 0).sum())
-    step = torch.arange(TILE, device=means2d.device)
+    step = torch.arange(TILE, device=means2d.device, dtype=torch.int64)
     place_y, place_x = (grid.reshape(-1) for grid in torch.meshgrid(step, step, indexing="ij"))
     begin = 0
     while begin < occupied:
@@ -74,7 +74,7 @@ def sum_over_pixels(
         # Arrays (B, L, 64) of 4 MB in float32, of which a walk holds a dozen.
         size = max(1, min(2**20 // (longest * PIXELS), occupied - begin))
         tiles = order[begin : begin + size]
-        place = torch.arange(longest, device=tiles.device)
+        place = torch.arange(longest, device=tiles.device, dtype=torch.int64)
         listed = place < lengths[begin : begin + size, None]  # (B, L)
         ids = gaussians[(starts[tiles, None] + place).clamp_max(gaussians.numel() - 1)]
         pixel_x = (tiles % across * TILE)[:, None] + place_x  # (B, 64)
@@ -89,7 +89,7 @@ def sum_over_pixels(
 def _walk(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: Tensor, inside: Tensor) -> PixelBlock:
     """Alphas and transmittances of a block; ``shape`` is (B, L, 6), pixels are (B, 64), ``listed`` is (B, L)."""
     mx, my, a, r, d, log2_opacity = (value[..., None] for value in shape.unbind(-1))
-    x, y = pixel_x[:, None] + 0.5 - mx, pixel_y[:, None] + 0.5 - my
+    x, y = (pixel[:, None].to(mx.dtype) + 0.5 - mean for pixel, mean in ((pixel_x, mx), (pixel_y, my)))
     across = x - r * y
     gx = a * across
     log2_alpha = log2_opacity - 0.5 * LOG2E * (gx * across + d * y * y)

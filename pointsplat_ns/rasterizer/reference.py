@@ -18,17 +18,18 @@ from pointsplat_ns.rasterizer.constants import (
     TRANSMITTANCE_MIN,
 )
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.system.tensors import FLAGS, FLOATS
 from pointsplat_ns.views import EPS2D
 
 
 def _rotation(quat: Tensor) -> Tensor:
     if quat.abs().max() < SHORTEST:
-        return torch.eye(3, dtype=quat.dtype)
+        return torch.eye(3, dtype=quat.dtype, device="cpu")
     w, x, y, z = (quat.double() / quat.double().norm()).to(quat.dtype)
     q = torch.stack([x, y, z])
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    return (w * w - q @ q) * torch.eye(3, dtype=quat.dtype) + 2 * torch.outer(q, q) + 2 * w * cross
+    return (w * w - q @ q) * torch.eye(3, dtype=quat.dtype, device="cpu") + 2 * torch.outer(q, q) + 2 * w * cross
 
 
 def _det(m: Tensor) -> Tensor:
@@ -55,10 +56,10 @@ def rasterize_reference(
     W, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = means @ W.T + t
-    ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    ys, xs = torch.meshgrid(torch.arange(height, **FLOATS) + 0.5, torch.arange(width, **FLOATS) + 0.5, indexing="ij")
     pixels = torch.stack([xs, ys], -1).to(means.dtype)
-    through = torch.ones(height, width, dtype=means.dtype)
-    alive = torch.ones(height, width, dtype=torch.bool)
+    through = torch.ones(height, width, dtype=means.dtype, device="cpu")
+    alive = torch.ones(height, width, **FLAGS)
     depth = torch.zeros_like(through)
     image = None
 
@@ -76,7 +77,7 @@ def rasterize_reference(
         R = _rotation(quats[i])
         covariance = R @ torch.diag(scales[i] ** 2) @ R.T
         cov2d = J @ W @ covariance @ W.T @ J.T
-        blurred = cov2d + eps2d * torch.eye(2, dtype=means.dtype)
+        blurred = cov2d + eps2d * torch.eye(2, dtype=means.dtype, device="cpu")
         opacity = opacities[i]
         if antialiased:
             ratio = _det(cov2d) / _det(blurred)
@@ -101,5 +102,5 @@ def rasterize_reference(
         through = torch.where(drawn, after, through)
 
     if image is None:
-        image = torch.zeros(height, width, 3 if sh_degree is not None else colors.shape[-1], dtype=means.dtype)
+        image = means.new_zeros(height, width, 3 if sh_degree is not None else colors.shape[-1])
     return image, 1 - through[..., None], depth[..., None]

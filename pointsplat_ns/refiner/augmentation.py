@@ -16,6 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.turning import turned
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +63,10 @@ class Transform:
 def random_transform(generator: torch.Generator | None = None) -> Transform:
     """A random transform: a rotation (half of the time about z, as most scenes have z up), a reflection or none, gains
     and order of the colour channels."""
-    upright, mirrored = (torch.rand(2, generator=generator) < torch.tensor([0.5, 0.5])).tolist()
-    quat = torch.randn(4, generator=generator, dtype=torch.float64)
+    upright, mirrored = (torch.rand(2, generator=generator, **FLOATS) < torch.tensor([0.5, 0.5], **FLOATS)).tolist()
+    quat = torch.randn(4, generator=generator, **DOUBLES)
     if upright:
         quat[1:3] = 0.0
     low, high = (0.7, 1.4)  # of the factors on colour channels
-    gains = low * (high / low) ** torch.rand(3, generator=generator, dtype=torch.float64)
-    return Transform(quat / quat.norm(), mirrored, gains, torch.randperm(3, generator=generator))
+    gains = low * (high / low) ** torch.rand(3, generator=generator, **DOUBLES)
+    return Transform(quat / quat.norm(), mirrored, gains, torch.randperm(3, generator=generator, device="cpu"))

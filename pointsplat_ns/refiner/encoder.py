@@ -6,57 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.refiner.layers import Linear, make_norm
 from pointsplat_ns.refiner.normalize import Features
-from pointsplat_ns.system.threads import one_thread
-
-
-class BatchNorm(nn.BatchNorm1d):
-    """Batch norm over points: ``[N, C] -> [N, C]``.
-
-    It differs from torch's in two ways. A single point, which has no variance, uses the running statistics. And the
-    running statistics start as plain averages, until the momentum exceeds one over the number of steps; otherwise their
-    initial values would still count after a short training.
-    """
-
-    MOMENTUM = 0.01
-
-    def __init__(self, channels: int):
-        super().__init__(channels, eps=1e-3, momentum=self.MOMENTUM)
-
-    def forward(self, x: Tensor) -> Tensor:
-        use_batch = self.training and x.shape[0] > 1
-        momentum = self.MOMENTUM
-        if use_batch and self.num_batches_tracked is not None:
-            self.num_batches_tracked.add_(1)
-            momentum = max(momentum, 1.0 / float(self.num_batches_tracked))
-        return nn.functional.batch_norm(
-            x, self.running_mean, self.running_var, self.weight, self.bias, use_batch, momentum, self.eps
-        )
-
-
-class SceneNorm(nn.Module):
-    """Normalises each channel over the points of the current scene: ``[N, C] -> [N, C]``.
-
-    As batch norm in training, but also in evaluation: there are no running statistics. A single point, which has no
-    variance, is its own mean.
-    """
-
-    def __init__(self, channels: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(channels))
-        self.bias = nn.Parameter(torch.zeros(channels))
-        self.eps = 1e-3
-
-    def forward(self, x: Tensor) -> Tensor:
-        if x.shape[0] < 2:
-            return (x - x) * self.weight + self.bias
-        with one_thread():  # the same rounding for any number of threads
-            return nn.functional.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, self.eps)
-
-
-def make_norm(kind: str, channels: int) -> nn.Module:
-    """The normalisation named in a :class:`RefinerConfig`: ``scene``, ``batch`` or ``layer``."""
-    return {"scene": SceneNorm, "batch": BatchNorm, "layer": nn.LayerNorm}[kind](channels)
 
 
 class DualBranchEncoder(nn.Module):
@@ -73,23 +24,23 @@ class DualBranchEncoder(nn.Module):
         dim = config.feature_dim
         self.gate_gain = dim if config.unit_gate else 1
         self.geometry = nn.Sequential(
-            nn.Linear(10, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim)
+            Linear(10, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), Linear(dim, dim)
         )
         self.position = None
         if config.use_position:
-            self.position = nn.Sequential(nn.Linear(3, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim))
+            self.position = nn.Sequential(Linear(3, dim), nn.ReLU(inplace=True), Linear(dim, dim))
         self.color = self.appearance = None
         if config.use_appearance:
             reduced = 0
             if config.num_rest:
                 reduced = config.color_dim
                 self.color = nn.Sequential(
-                    nn.Linear(3 * config.num_rest, config.color_hidden),
+                    Linear(3 * config.num_rest, config.color_hidden),
                     nn.ReLU(inplace=True),
-                    nn.Linear(config.color_hidden, reduced),
+                    Linear(config.color_hidden, reduced),
                 )
             self.appearance = nn.Sequential(
-                nn.Linear(4 + reduced, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), nn.Linear(dim, dim)
+                Linear(4 + reduced, dim), make_norm(config.norm, dim), nn.ReLU(inplace=True), Linear(dim, dim)
             )
 
     def forward(self, features: Features) -> Tensor:

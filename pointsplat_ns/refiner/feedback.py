@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io.files import write_tensors
+from pointsplat_ns.refiner.layers import Linear
 from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
 FEEDBACK_FORMAT = "pointsplat-feedback/2"
@@ -43,15 +44,16 @@ class FeedbackRefiner(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        width = self.FEATURES
-        for _ in range(2):
-            layers += [nn.Linear(width, 64), nn.SiLU()]
-            width = 64
-        last = nn.Linear(width, len(PARAMETERS))
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        self.mlp = nn.Sequential(*layers, last)
+        with torch.device("cpu"):
+            layers: list[nn.Module] = []
+            width = self.FEATURES
+            for _ in range(2):
+                layers += [Linear(width, 64), nn.SiLU()]
+                width = 64
+            last = Linear(width, len(PARAMETERS))
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+            self.mlp = nn.Sequential(*layers, last)
 
     def forward(self, features: Tensor) -> Tensor:
         """Factors of the steps, (N, 6), above 0, in the order of :data:`~pointsplat_ns.gaussians.PARAMETERS`, from

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.refiner.layers import Linear
 from pointsplat_ns.system.threads import one_thread
 
 
@@ -48,9 +49,9 @@ def _head(in_channels: int, config: RefinerConfig, out_channels: int) -> nn.Sequ
     layers: list[nn.Module] = []
     width = in_channels
     for _ in range(config.head_depth - 1):
-        layers += [nn.Linear(width, config.head_width), nn.ReLU(inplace=True)]
+        layers += [Linear(width, config.head_width), nn.ReLU(inplace=True)]
         width = config.head_width
-    last = nn.Linear(width, out_channels)
+    last = Linear(width, out_channels)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
     return nn.Sequential(*layers, last)

@@ -13,10 +13,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pointsplat_ns.refiner.config import RefinerConfig
-from pointsplat_ns.refiner.encoder import make_norm
+from pointsplat_ns.refiner.layers import LayerNorm, Linear, make_norm
 from pointsplat_ns.refiner.serialization import Order, by_patches
 from pointsplat_ns.refiner.sparse_ops import by_rows, rows_at_a_time, segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import GridLevel, Structure
+from pointsplat_ns.system.tensors import of_network
 
 
 class SubmanifoldConv(nn.Module):
@@ -28,8 +29,8 @@ class SubmanifoldConv(nn.Module):
     def __init__(self, in_channels: int, out_channels: int, bias: bool = True):
         super().__init__()
         bound = (27 * in_channels) ** -0.5
-        self.weight = nn.Parameter(torch.empty(27, in_channels, out_channels).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        self.weight = nn.Parameter(torch.empty(27, in_channels, out_channels, **of_network()).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(out_channels, **of_network())) if bias else None
 
     def forward(self, x: Tensor, level: GridLevel, then: Callable[[Tensor], Tensor] | None = None) -> Tensor:
         """``[M, Cin] -> [M, Cout]``; ``then`` is applied row by row, to the result of each cell once."""
@@ -51,8 +52,8 @@ class PatchAttention(nn.Module):
     def __init__(self, channels: int, heads: int, patch: int):
         super().__init__()
         self.heads, self.patch = heads, patch
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.proj = nn.Linear(channels, channels)
+        self.qkv = Linear(channels, 3 * channels)
+        self.proj = Linear(channels, channels)
 
     def forward(self, x: Tensor, order: Order | None = None) -> Tensor:
         """``[M, C] -> [M, C]``; ``order`` along a curve, None for memory order."""
@@ -74,12 +75,12 @@ class Block(nn.Module):
         super().__init__()
         self.drop_path = drop_path
         self.conv = SubmanifoldConv(channels, channels)
-        self.conv_out = nn.Sequential(nn.Linear(channels, channels), nn.LayerNorm(channels))
-        self.norm1 = nn.LayerNorm(channels)
+        self.conv_out = nn.Sequential(Linear(channels, channels), LayerNorm(channels))
+        self.norm1 = LayerNorm(channels)
         self.attention = PatchAttention(channels, heads, config.patch)
-        self.norm2 = nn.LayerNorm(channels)
+        self.norm2 = LayerNorm(channels)
         self.hidden = channels * config.mlp_ratio
-        self.mlp = nn.Sequential(nn.Linear(channels, self.hidden), nn.GELU(), nn.Linear(self.hidden, channels))
+        self.mlp = nn.Sequential(Linear(channels, self.hidden), nn.GELU(), Linear(self.hidden, channels))
 
     def forward(self, x: Tensor, level: GridLevel, order: Order | None) -> Tensor:
         """``[M, C] -> [M, C]``; ``order`` along the curve that the patches follow, None for memory order."""
@@ -117,7 +118,7 @@ class Pool(nn.Module):
 
     def __init__(self, in_channels: int, out_channels: int, norm: str):
         super().__init__()
-        self.proj = nn.Linear(in_channels, out_channels)
+        self.proj = Linear(in_channels, out_channels)
         self.out = nn.Sequential(make_norm(norm, out_channels), nn.GELU())
 
     def forward(self, x: Tensor, cluster: Tensor, size: int) -> Tensor:
@@ -131,8 +132,8 @@ class Unpool(nn.Module):
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: str):
         super().__init__()
-        self.coarse = nn.Sequential(nn.Linear(in_channels, out_channels), make_norm(norm, out_channels), nn.GELU())
-        self.skip = nn.Sequential(nn.Linear(skip_channels, out_channels), make_norm(norm, out_channels), nn.GELU())
+        self.coarse = nn.Sequential(Linear(in_channels, out_channels), make_norm(norm, out_channels), nn.GELU())
+        self.skip = nn.Sequential(Linear(skip_channels, out_channels), make_norm(norm, out_channels), nn.GELU())
 
     def forward(self, x: Tensor, skip: Tensor, cluster: Tensor) -> Tensor:
         """``[size, Cin], [M, Cskip] -> [M, Cout]``."""
@@ -182,7 +183,7 @@ class PointTransformer(nn.Module):
         """Indices of the curves for the blocks of a stage: shuffled in training, else in the configured order."""
         if not self.training:
             return list(range(self.num_curves))
-        return torch.randperm(self.num_curves).tolist()
+        return torch.randperm(self.num_curves, device="cpu").tolist()
 
 
 def _ramp(top: float, count: int) -> list[float]:

@@ -32,6 +32,10 @@ class Refiner(nn.Module):
     Residuals do not depend on the scene's unit and position, on the order of its Gaussians (in evaluation; exact
     duplicates are interchangeable) or on the signs of its quaternions.
 
+    Args:
+        config: the network's layers.
+        device: where its parameters, float32, are made; "meta" for shapes without memory.
+
     Example:
         >>> from pointsplat_ns.refiner import Refiner, preset
         >>> refiner = Refiner(preset("tiny")).eval()
@@ -39,12 +43,13 @@ class Refiner(nn.Module):
         0
     """
 
-    def __init__(self, config: RefinerConfig):
+    def __init__(self, config: RefinerConfig, device: torch.device | str = "cpu"):
         super().__init__()
         self.config = config
-        self.encoder = make_encoder(config)
-        self.backbone = PointTransformer(config.encoded_dim, config)
-        self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
+        with torch.device(device):
+            self.encoder = make_encoder(config)
+            self.backbone = PointTransformer(config.encoded_dim, config)
+            self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
 
     def prepare(self, scene: Gaussians) -> Structure | None:
         """Build the neighbour tables of a scene's positions, on the scene's device.

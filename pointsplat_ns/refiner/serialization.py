@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.geometry.transforms import interleave, spread_bits
 from pointsplat_ns.refiner.sparse_ops import by_rows, permute, rows_at_a_time
+from pointsplat_ns.system.tensors import INDICES
 
 
 def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
@@ -100,7 +101,7 @@ def _hilbert_states() -> tuple[Tensor, Tensor]:
                 queue.append(reached)
             digits.append(sum((bit ^ parity) << (2 - i) for i, bit in enumerate(gray)))
             following.append(states[reached])
-    return torch.tensor(digits).view(-1, 8), torch.tensor(following).view(-1, 8)
+    return torch.tensor(digits, **INDICES).view(-1, 8), torch.tensor(following, **INDICES).view(-1, 8)
 
 
 Order = tuple[Tensor, Tensor]

@@ -157,7 +157,7 @@ def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
     # The three cells of another column (dx, dy) are consecutive in the sorted keys, so one search finds them all. Its
     # targets are sorted too, which halves its time.
     columns = [(i, (dx * side + dy) * side - 1) for i, (dx, dy, dz) in enumerate(HALF_KERNEL) if dz == -1]
-    numbers, steps = torch.tensor(columns, device=keys.device)[:, :, None].unbind(1)
+    numbers, steps = torch.tensor(columns, device=keys.device, dtype=torch.int64)[:, :, None].unbind(1)
     numbered, target = (index + numbers * m).flatten(), (keys + steps.to(keys.dtype)).flatten()
     place = torch.searchsorted(keys, target)
     keys = torch.cat([keys, keys.new_full((1,), torch.iinfo(keys.dtype).max)])
@@ -223,7 +223,7 @@ def _argsort_pair(codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _invert(order: Tensor) -> Tensor:
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device, dtype=torch.int64))
 
 
 def _log2_product(strides: tuple[int, ...]) -> int:

@@ -127,8 +127,7 @@ def _hollow(header: dict[str, str], tensors: int, path: Path) -> Refiner:
     layers = sum(config.enc_depths) + sum(config.dec_depths) + config.head_depth
     if layers > tensors:
         raise WeightsError(f"{path}: {tensors} tensors for {layers} layers; the file is damaged or of another version")
-    with torch.device("meta"):
-        return Refiner(config)
+    return Refiner(config, device="meta")
 
 
 def _shape(tensors: dict[str, Any], name: str) -> tuple[int, ...] | str:

@@ -15,6 +15,7 @@ from torch import Tensor
 from pointsplat_ns.rooms.building import Light, Material
 from pointsplat_ns.rooms.raycast import Solids, chart_points, chart_size, dot, occluded, trace, unit
 from pointsplat_ns.rooms.textures import Canvas
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 
 
@@ -56,11 +57,11 @@ class ChartGrids:
             for _ in range(levels - 1):
                 image = F.adaptive_avg_pool2d(image, (max(1, image.shape[1] // 2), max(1, image.shape[2] // 2)))
                 pyramids[-1].append(image)
-        shapes = torch.tensor([[image.shape[1:] for image in pyramid] for pyramid in pyramids])
+        shapes = torch.tensor([[image.shape[1:] for image in pyramid] for pyramid in pyramids], **INDICES)
         counts = shapes.prod(-1).reshape(-1)
         data = torch.cat([image.flatten(1).T for pyramid in pyramids for image in pyramid])
         start = (counts.cumsum(0) - counts).view(len(images), levels)
-        return cls(data, start, shapes[..., 1], shapes[..., 0], torch.tensor(spacing))
+        return cls(data, start, shapes[..., 1], shapes[..., 0], torch.tensor(spacing, **FLOATS))
 
     def sample(self, chart: Tensor, u: Tensor, v: Tensor, footprint: Tensor) -> Tensor:
         """Value (M, C) of samples that cover ``footprint`` metres (M,): bilinear, in the level nearest to that;
@@ -104,7 +105,7 @@ def bake(solids: Solids, materials: tuple[Material, ...], lights: tuple[Light, .
     shell = light.start[6, 0]
     albedo = texture.data[: texture.start[0, 1]].mean()
     gloss, shininess, emission = (
-        torch.tensor([getattr(material, name) for material in materials], dtype=torch.float32)
+        torch.tensor([getattr(material, name) for material in materials], **FLOATS)
         for name in ("gloss", "shininess", "emission")
     )
     return BakedRoom(texture, light, gloss, shininess, emission, float(0.34 / (light.data[:shell, :3].mean() * albedo)))
@@ -127,7 +128,8 @@ def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
     for chart in range(6 * len(solids)):
         width, height = chart_size(solids, chart)
         rows, columns = max(round(height / LIGHT.lumel), 2), max(round(width / LIGHT.lumel), 2)
-        v, u = torch.meshgrid((torch.arange(rows) + 0.5) / rows, (torch.arange(columns) + 0.5) / columns, indexing="ij")
+        v, u = ((torch.arange(count, **FLOATS) + 0.5) / count for count in (rows, columns))
+        v, u = torch.meshgrid(v, u, indexing="ij")
         shapes.append((rows, columns))
         placed.append(chart_points(solids, chart, u.reshape(-1), v.reshape(-1)))
     points, normals = (torch.cat(parts, 1) for parts in zip(*placed, strict=True))
@@ -146,7 +148,7 @@ def _illuminate(solids: Solids, lights: tuple[Light, ...]) -> ChartGrids:
 def _direct(solids: Solids, light: Light, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Irradiance / pi (M, 3) at points (3, M) from a light, and its visible share (M,), by 4 x 4 samples of it."""
     center, edge_u, edge_v, color = map(torch.tensor, (light.center, light.edge_u, light.edge_v, light.color))
-    strength, visible = torch.zeros(points.shape[1]), torch.zeros(points.shape[1])
+    strength, visible = torch.zeros(points.shape[1], **FLOATS), torch.zeros(points.shape[1], **FLOATS)
     for a in (-0.75, -0.25, 0.25, 0.75):
         for b in (-0.75, -0.25, 0.25, 0.75):
             sample = center + a * edge_u + b * edge_v
@@ -165,12 +167,12 @@ def _openness(solids: Solids, points: Tensor, normals: Tensor) -> Tensor:
     """Share (M,) of ambient light that arrives at points (3, M): all where the hemisphere is free for 1 m, 0.4 in gaps
     and inside of solids."""
     count = 24
-    steps = torch.arange(count) + 0.5
+    steps = torch.arange(count, **FLOATS) + 0.5
     angle, up = steps * (math.pi * (3 - math.sqrt(5))), 1 - 2 * steps / count
     radius = (1 - up * up).sqrt()
     sphere = torch.stack([radius * angle.cos(), radius * angle.sin(), up])[:, None]  # evenly over a sphere
-    open_share = torch.empty(points.shape[1])
-    for part in torch.arange(points.shape[1]).split((1 << 15) // count):
+    open_share = torch.empty(points.shape[1], **FLOATS)
+    for part in torch.arange(points.shape[1], **INDICES).split((1 << 15) // count):
         # The normal plus a point of the unit sphere: distributed by the cosine.
         ways = unit(normals[:, part, None] + sphere).reshape(3, -1)
         distance, _ = trace(solids, points[:, part].repeat_interleave(count, 1), ways)

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import FLAGS, INDICES
+
 
 def dot(a, b) -> Tensor:
     """Inner product over the leading axis of 3; faster than a sum over so short an axis."""
@@ -64,7 +66,7 @@ def trace(solids: Solids, origins: Tensor, directions: Tensor) -> tuple[Tensor, 
     """First hit of rays from ``origins`` (3, M), or (3, 1) for a camera's, inside the room along ``directions`` (3, M):
     its distance in multiples of the direction and the solid, each (M,)."""
     _, best = solids.interval(0, origins, directions)
-    index = torch.zeros(len(best), dtype=torch.int64)
+    index = torch.zeros(len(best), **INDICES)
     for number in _in_cone(solids, origins, directions) if origins.shape[1] == 1 else range(1, len(solids)):
         near, far = solids.interval(number, origins, directions)
         hit = (near < far) & (near > 1e-4) & (near < best)
@@ -88,7 +90,7 @@ def _in_cone(solids: Solids, origin: Tensor, directions: Tensor) -> list[int]:
 def occluded(solids: Solids, origins: Tensor, target: Tensor) -> Tensor:
     """bool (M,): an opaque solid lies between ``origins`` (3, M) and the point ``target`` (3,)."""
     directions = target[:, None] - origins
-    blocked = torch.zeros(origins.shape[1], dtype=torch.bool)
+    blocked = torch.zeros(origins.shape[1], **FLAGS)
     for number in solids.opaque[1:].nonzero()[:, 0].tolist():
         near, far = solids.interval(number + 1, origins, directions)
         blocked |= (near < far) & (far > 1e-4) & (near < 1 - 1e-4)

@@ -6,13 +6,14 @@ from torch import Tensor
 from pointsplat_ns.rooms.building import Light
 from pointsplat_ns.rooms.raycast import dot, surface, trace, unit
 from pointsplat_ns.rooms.room import Room
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
 
 def default_intrinsics(width: int, height: int) -> Tensor:
     """(3, 3) intrinsics in pixels of a camera that sees 78 degrees across, the first pixel's centre at (0.5, 0.5)."""
     focal = 0.62 * width
-    return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], **FLOATS)
 
 
 def render_room(
@@ -59,7 +60,7 @@ def render_room(
 
 def _camera_rays(K: Tensor, width: int, height: int, side: int) -> Tensor:
     """(3, M) camera-space directions with z = 1 through the middles of ``side`` x ``side`` parts of all pixels."""
-    x, y = ((torch.arange(count * side) + 0.5) / side for count in (width, height))
+    x, y = ((torch.arange(count * side, **FLOATS) + 0.5) / side for count in (width, height))
     v, u = torch.meshgrid((y - K[1, 2]) / K[1, 1], (x - K[0, 2]) / K[0, 0], indexing="ij")
     return torch.stack([u, v, torch.ones_like(u)]).flatten(1)
 
@@ -84,7 +85,7 @@ def _shaded(room: Room, eye: Tensor, ways: Tensor, K: Tensor, highlights: bool) 
         part = (seen > 1e-3).nonzero()[:, 0]
         shininess = baked.shininess[hits.chart[part]]
         lobe = seen[part] * _highlight(source, points[:, part], hits.normal[:, part], view[:, part], shininess)
-        tint = torch.tensor(source.color)
+        tint = torch.tensor(source.color, **FLOATS)
         radiance.index_add_(0, part, lobe[:, None] * (tint / tint.max() / baked.exposure))
     return radiance
 
@@ -97,11 +98,11 @@ def _highlight(light: Light, points: Tensor, normal: Tensor, view: Tensor, shini
     strength at grazing view, follows the half vector.
     """
     mirrored = 2 * dot(view, normal) * normal - view
-    target = torch.tensor(light.center)[:, None]
+    target = torch.tensor(light.center, **FLOATS)[:, None]
     distance = dot(target - points, light.normal) / dot(mirrored, light.normal).clamp(max=-1e-3)
     meet = points + mirrored * distance.clamp(0, 100) - target
     for edge in (light.edge_u, light.edge_v):
-        target = target + (dot(meet, edge) / dot(edge, edge)).clamp(-1, 1) * torch.tensor(edge)[:, None]
+        target = target + (dot(meet, edge) / dot(edge, edge)).clamp(-1, 1) * torch.tensor(edge, **FLOATS)[:, None]
     way = unit(target - points)
     half = unit(way + view)
     lobe = dot(half, normal).clamp(min=1e-6) ** shininess

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import INDICES
+
 CHUNK = 1 << 16
 """Number of rows of a piece."""
 
@@ -17,7 +19,7 @@ def in_pieces(
     """Results (n, *shape) of a function for all members (n,), computed for a piece (m,) of them at a time.
 
     They are written into one tensor: small results kept apart would hold on to the memory of the large pieces."""
-    result = torch.empty(len(members), *shape, dtype=dtype)
-    for these in torch.arange(len(members)).split(CHUNK):
+    result = torch.empty(len(members), *shape, dtype=dtype, device="cpu")
+    for these in torch.arange(len(members), **INDICES).split(CHUNK):
         result[these] = function(members[these]).to(dtype)
     return result

@@ -65,7 +65,7 @@ def any_rank(flag: bool, device: torch.device | str) -> bool:
     """Whether ``flag`` is set in any process. All processes must call this, each with its own device."""
     if world_size() == 1:
         return flag
-    count = torch.tensor([float(flag)], device=device)
+    count = torch.tensor([float(flag)], device=device, dtype=torch.float32)
     dist.all_reduce(count)
     return bool(count > 0)
 

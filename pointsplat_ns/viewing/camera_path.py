@@ -24,6 +24,7 @@ from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.viewing.trajectories import along, fitted, orbit, walk
 from pointsplat_ns.views import Views
 
@@ -204,11 +205,11 @@ def read_path(path: Path | str) -> SavedPath:
     if content.get("crop"):
         logger.warning("%s: its crop is not applied", path)
     poses, focals = zip(*(_camera(camera, index, height, path) for index, camera in enumerate(cameras)), strict=True)
-    Ks = torch.zeros(len(cameras), 3, 3, dtype=torch.float64)
-    Ks[:, 0, 0] = Ks[:, 1, 1] = torch.tensor(focals, dtype=torch.float64)
+    Ks = torch.zeros(len(cameras), 3, 3, **DOUBLES)
+    Ks[:, 0, 0] = Ks[:, 1, 1] = torch.tensor(focals, **DOUBLES)
     Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
     fps = finite(content.get("fps"))
-    views = Views(viewmats_from_opengl(torch.stack(poses)), Ks, width, height, torch.zeros(3))
+    views = Views(viewmats_from_opengl(torch.stack(poses)), Ks, width, height, torch.zeros(3, **FLOATS))
     return SavedPath(views, fps if fps is not None and 0 < fps <= 1000 else None)
 
 
@@ -225,9 +226,9 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
     numbers = [finite(value) for value in values] if isinstance(values, list) and len(values) == 16 else [None]
     if any(number is None for number in numbers):
         raise DataError(f"{path}: camera {index} has no pose; expected 'camera_to_world', 16 finite numbers")
-    pose = torch.tensor(numbers, dtype=torch.float64).view(4, 4)
+    pose = torch.tensor(numbers, **DOUBLES).view(4, 4)
     turn = pose[:3, :3]
-    off = (turn @ turn.T - torch.eye(3)).abs().max()
+    off = (turn @ turn.T - torch.eye(3, **FLOATS)).abs().max()
     last = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()
     rigid = (off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)  # nerfstudio writes 16 digits
     if not bool(rigid):  # NaN fails too

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.viewing.film import Wipe, to_uint8, with_line
 from pointsplat_ns.viewing.schedule import DrawingStep, Schedule
 from pointsplat_ns.viewing.selection import ReducedScene
@@ -38,7 +39,7 @@ class ViewerCamera:
         width, height = (side, round(side / aspect)) if aspect >= 1 else (round(side * aspect), side)
         width, height = max(width, 1), max(height, 1)
         focal = 0.5 * height / math.tan(0.5 * min(max(self.fov, 0.01), 3.1))
-        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], **DOUBLES)
         return View(self.viewmat, K, width, height, self.background, near_plane=self.near_plane)
 
 

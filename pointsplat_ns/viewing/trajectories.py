@@ -15,6 +15,7 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 
@@ -73,7 +74,7 @@ def orbit(views: Views, frames: int, centre: Tensor, up: Tensor | None = None) -
     places, turns = (torch.from_numpy(values) for values in _poses(views))
     ahead, up = turns[:, :, 2], up_of(views) if up is None else up
     focus = _focus(places, ahead, centre.double())
-    time = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
+    time = 2 * math.pi * torch.arange(frames, **DOUBLES) / frames
     still = np.zeros(frames)
     if float((((focus - places) * ahead).sum(1) > 0).double().mean()) < 0.7:
         nearest = int((places - focus).norm(dim=1).argmin())
@@ -205,8 +206,8 @@ def _upright(eyes: Tensor, angles: Tensor, up: Tensor) -> Tensor:
 
 def _focus(places: Tensor, ahead: Tensor, centre: Tensor) -> Tensor:
     """The point (3,) nearest to the optical axes of cameras, with a small pull to ``centre``."""
-    across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None]
-    pull = 0.02 * len(places) * torch.eye(3, dtype=torch.float64)  # decides where all cameras look the same way
+    across = torch.eye(3, **DOUBLES) - ahead[:, :, None] * ahead[:, None]
+    pull = 0.02 * len(places) * torch.eye(3, **DOUBLES)  # decides where all cameras look the same way
     return torch.linalg.solve(across.sum(0) + pull, (across @ places[:, :, None]).sum(0)[:, 0] + pull @ centre)
 
 

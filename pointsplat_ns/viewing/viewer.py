@@ -25,6 +25,7 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.system.memory import share_freed_memory
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.viewing.painter import PictureRequest, ViewerCamera, Watcher
 from pointsplat_ns.viewing.selection import Selection
 from pointsplat_ns.viewing.server import READABLE_NAMES, Answer, Request, Route, Served, Server, received
@@ -100,10 +101,10 @@ class _Stage:
         width, height = (min(max(int(wanted[name]), 1), VIEWER.largest_side) for name in ("width", "height"))
         eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
         turn = torch.stack([right, down, ahead])
-        if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() < 1e-3).all()):
+        if not bool(((turn @ turn.T - torch.eye(3, **DOUBLES)).abs() < 1e-3).all()):
             raise ValueError("no rotation")
         place = eye * (self.frame.size / UNITS) + self.frame.centre
-        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat = torch.eye(4, **DOUBLES)
         viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ place
         share = math.tan(0.5 * min(max(float(camera["fov"]), 0.01), 3.1)) * height / max(width, height)
         near = views.near_plane * self.frame.size / UNITS
@@ -287,7 +288,7 @@ def _refused(text: str) -> Answer:
 
 def _vector(values: Any) -> torch.Tensor:
     """A vector (3,) of finite numbers, float64."""
-    vector = torch.tensor([float(value) for value in values], dtype=torch.float64)
+    vector = torch.tensor([float(value) for value in values], **DOUBLES)
     if vector.shape != (3,) or not bool(vector.isfinite().all()):
         raise ValueError("no vector")
     return vector

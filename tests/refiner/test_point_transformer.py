@@ -4,7 +4,7 @@ import torch.nn.functional as F
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner.config import preset
-from pointsplat_ns.refiner.encoder import BatchNorm, SceneNorm
+from pointsplat_ns.refiner.layers import BatchNorm, SceneNorm
 from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, SubmanifoldConv
 from pointsplat_ns.refiner.structure import build_structure
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -117,7 +118,7 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
         DataError: if a number is not finite, or a matrix is no rigid motion.
     """
     turn = values[:, :3, :3]
-    off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype)).abs().amax((1, 2))
+    off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype, device="cpu")).abs().amax((1, 2))
     good = (
         values.isfinite().all(2).all(1) & (off <= CAMERA_LIMITS.deviation) & (torch.linalg.det(turn) > 0)
     )  # NaN fails too
@@ -154,12 +155,12 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     """
     need_count(path, len(cameras))
     names = [camera.name for camera in cameras]
-    poses = torch.tensor([camera.pose for camera in cameras], dtype=torch.float64).view(-1, 4, 4)
+    poses = torch.tensor([camera.pose for camera in cameras], **DOUBLES).view(-1, 4, 4)
     poses = rigid(poses, f"{path}: the pose", names)
     if motion is not None:
         poses = motion.of(poses)
     sizes, focals, centres = (
-        torch.tensor([camera[field] for camera in cameras], dtype=torch.float64).view(-1, 2) for field in (2, 3, 4)
+        torch.tensor([camera[field] for camera in cameras], **DOUBLES).view(-1, 2) for field in (2, 3, 4)
     )
     reached = poses[:, :3, 3].abs().amax(1) <= CAMERA_LIMITS.coordinate
     whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= CAMERA_LIMITS.pixels)).all(1)
@@ -177,12 +178,12 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     counts = Counter((int(width), int(height)) for width, height in sizes.tolist())
     width, height = max(counts, key=lambda size: (counts[size], size[0] * size[1]))
     stretch = sizes.new_tensor([width, height]) / sizes
-    Ks = torch.eye(3, dtype=torch.float64).repeat(len(cameras), 1, 1)
+    Ks = torch.eye(3, **DOUBLES).repeat(len(cameras), 1, 1)
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = focals * stretch, centres * stretch
     order = list(range(len(cameras)))
     if all(names):  # digits count as numbers
         order.sort(key=lambda index: re.sub(r"\d+", lambda digits: digits[0].zfill(20), names[index]))
-    return Views(invert_rigid(poses)[order], Ks[order], width, height, torch.zeros(3))
+    return Views(invert_rigid(poses)[order], Ks[order], width, height, torch.zeros(3, **FLOATS))
 
 
 def need_count(path: Path, count: int) -> None:

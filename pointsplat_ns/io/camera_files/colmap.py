@@ -20,6 +20,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
 from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.system.tensors import DOUBLES
 
 COLMAP_CAMERAS = {
     "SIMPLE_PINHOLE": (0, 1, 3), "PINHOLE": (1, 2, 4), "SIMPLE_RADIAL": (2, 1, 4), "RADIAL": (3, 1, 5),
@@ -88,7 +89,7 @@ def colmap_cameras(path: Path) -> CameraFile:
     bent = sum(lenses[image.camera].bent for image in images)
     if bent:
         logger.info("%s: the lens distortion of %d of %d cameras is ignored", folder, bent, len(images))
-    poses = torch.tensor([image.pose for image in images], dtype=torch.float64)
+    poses = torch.tensor([image.pose for image in images], **DOUBLES)
     matrices = invert_rigid(torch.cat([rotation_matrices(poses[:, :4]), poses[:, 4:, None]], dim=2))
     # The length of a quaternion is free, within what can be squared. Others become NaN, which is refused with its name.
     lengths = poses[:, :4].norm(dim=1)
@@ -97,7 +98,7 @@ def colmap_cameras(path: Path) -> CameraFile:
         Camera(image.name, pose, *lenses[image.camera][:3])
         for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
     ]
-    return CameraFile(cameras, Motion(torch.eye(4, dtype=torch.float64)[:3]))
+    return CameraFile(cameras, Motion(torch.eye(4, **DOUBLES)[:3]))
 
 
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:

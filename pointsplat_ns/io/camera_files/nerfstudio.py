@@ -18,6 +18,7 @@ import torch
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, matrix, need_count, rigid
 from pointsplat_ns.io.files import logger
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
@@ -78,14 +79,14 @@ def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
     """Transform from the original world to that of the file."""
     rows = content.get("applied_transform")
     if rows is None:
-        rows = torch.eye(4)[:3].tolist()
+        rows = torch.eye(4, **FLOATS)[:3].tolist()
         if (path.parent / "colmap" / "sparse" / "0").is_dir():  # as nerfstudio takes a file of an early version
             rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
     scale = finite(content.get("applied_scale", 1.0))
     try:
-        transform = torch.tensor(rows, dtype=torch.float64)
+        transform = torch.tensor(rows, **DOUBLES)
     except (ValueError, TypeError, RuntimeError, OverflowError):
-        transform = torch.empty(0)
+        transform = torch.empty(0, **FLOATS)
     if transform.shape != (3, 4) or scale is None or not 0 < scale:
         raise DataError(
             f"{path}: its 'applied_transform' or 'applied_scale' is not usable; expected 3 x 4 numbers and a number "

@@ -21,6 +21,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import interleave, spread_bits, zero_as_identity
 from pointsplat_ns.io.files import one_line, require_memory
+from pointsplat_ns.system.tensors import INDICES
 
 SATURATED = 0.25
 """Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
@@ -185,7 +186,7 @@ def from_smallest_three(largest: Array, others: Array) -> Array:
 def morton_order(scene: Gaussians) -> Tensor:
     """Indices (N,) that bring neighbours in space together."""
     if len(scene) == 0:
-        return torch.zeros(0, dtype=torch.int64)
+        return torch.zeros(0, **INDICES)
     low, high = scene.means.double().aminmax(dim=0)
     cells = ((scene.means.double() - low) / (high - low).clamp_min(1e-300) * 0x1FFFFF).long()
     return interleave(*(spread_bits(axis) for axis in cells.unbind(1))).argsort(stable=True)

@@ -35,6 +35,7 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.formats.spz import decode_spz
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import DOUBLES
 
 JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
@@ -107,7 +108,7 @@ def _matrix(node: dict[str, Any]) -> Array:
     else:
         matrix = np.eye(4)
         x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-        turn = rotation_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+        turn = rotation_matrices(torch.tensor([[w, x, y, z]], **DOUBLES))[0].numpy()
         matrix[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         matrix[:3, 3] = np.asarray(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     if not np.isfinite(matrix).all():
@@ -122,7 +123,7 @@ def _moved(scene: Gaussians, matrix: Array, path: Path) -> Gaussians:
     linear = torch.from_numpy(matrix[:3, :3].copy())
     scale = float(torch.linalg.det(linear).abs()) ** (1 / 3)
     turn = linear / scale if scale > 0 else linear
-    if not torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-4):
+    if not torch.allclose(turn @ turn.T, torch.eye(3, **DOUBLES), atol=1e-4):
         logger.warning("%s: a node that skews or scales unevenly is not applied", path)
         return scene
     return Similarity(turn, scale, torch.from_numpy(matrix[:3, 3].copy())).apply(scene)

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+
 LEVELS = 256
 """Entries of a codebook of numbers."""
 
@@ -22,7 +24,7 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     the codebook (256,), ascending, and the index of the nearest entry for each value, uint8 of the same shape."""
     flat = values.flatten()
     if not flat.numel():
-        return torch.zeros(LEVELS), torch.zeros(values.shape, dtype=torch.uint8)
+        return torch.zeros(LEVELS, **FLOATS), torch.zeros(values.shape, dtype=torch.uint8, device="cpu")
     book = _distinct(flat)
     if book is None:
         ordered = torch.cat([flat[:: -(-flat.numel() // _SAMPLE)], flat.amin()[None], flat.amax()[None]])
@@ -30,7 +32,7 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
         for _ in range(20):
             index = _nearest(book, ordered)
             count = torch.bincount(index, minlength=LEVELS)
-            total = torch.zeros(LEVELS, dtype=torch.float64).index_add_(0, index, ordered.double())
+            total = torch.zeros(LEVELS, **DOUBLES).index_add_(0, index, ordered.double())
             book = torch.where(count > 0, (total / count.clamp_min(1)).float(), book).sort().values
     return book, _nearest(book, flat).to(torch.uint8).reshape(values.shape)
 
@@ -39,7 +41,7 @@ def _distinct(values: Tensor) -> Tensor | None:
     """The values themselves, if no more than 256 of them differ; the last is repeated."""
     distinct = values[: 2 * LEVELS].unique()
     distinct = distinct if len(distinct) > LEVELS else values.unique()
-    return distinct[torch.arange(LEVELS).clamp_max(len(distinct) - 1)] if len(distinct) <= LEVELS else None
+    return distinct[torch.arange(LEVELS, **INDICES).clamp_max(len(distinct) - 1)] if len(distinct) <= LEVELS else None
 
 
 def _spread(values: Tensor) -> Tensor:
@@ -49,7 +51,7 @@ def _spread(values: Tensor) -> Tensor:
     bins = min(max(values.numel() // 16, 64), 4096)
     density = torch.histc(values, bins, low, high).double().pow(1 / 3)
     below = torch.cat([density.new_zeros(1), density.cumsum(0)])
-    wanted = (torch.arange(LEVELS, dtype=torch.float64) + 0.5) / LEVELS * below[-1]
+    wanted = (torch.arange(LEVELS, **DOUBLES) + 0.5) / LEVELS * below[-1]
     bin_ = (torch.searchsorted(below, wanted) - 1).clamp(0, bins - 1)
     within = (wanted - below[bin_]) / density[bin_].clamp_min(1e-12)
     return (low + (high - low) * (bin_ + within) / bins).float()
@@ -88,17 +90,17 @@ def palette(
     branches, deepest = 64, 6  # clusters that rows are split into, and how often
     if (found := _different(rows, size)) is not None:
         return found
-    weights = torch.ones(n) if weights is None else weights.float()
+    weights = torch.ones(n, **FLOATS) if weights is None else weights.float()
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
-    book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, dtype=torch.int64)
-    waiting = [(torch.arange(n), size, 0)]
+    book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, **INDICES)
+    waiting = [(torch.arange(n, **INDICES), size, 0)]
     used = done = 0
     while waiting:
         members, k, depth = waiting.pop()
         part, weight = rows[members], weights[members]
         at_once = k <= branches or k * len(part) <= _AT_ONCE
         if not at_once and depth < deepest:
-            sample = torch.randperm(len(part), generator=generator)[:_SAMPLE]
+            sample = torch.randperm(len(part), generator=generator, device="cpu")[:_SAMPLE]
             centres = _means(part[sample], weight[sample], branches, generator)
             of = _assign(part, centres)
             counts = torch.bincount(of, minlength=branches)
@@ -125,15 +127,15 @@ def palette(
 def _piece_of(rows: Tensor, k: int) -> Tensor:
     """Which of ``k`` pieces of about one size each row (N, D) is in, along the column that varies most."""
     order = rows[:, int(rows.var(dim=0).argmax())].argsort(stable=True)
-    pieces = torch.empty(len(rows), dtype=torch.int64)
-    pieces[order] = torch.arange(len(rows)) * k // len(rows)
+    pieces = torch.empty(len(rows), **INDICES)
+    pieces[order] = torch.arange(len(rows), **INDICES) * k // len(rows)
     return pieces
 
 
 def _different(rows: Tensor, most: int) -> tuple[Tensor, Tensor] | None:
     """The rows themselves and the index of each, if at most ``most`` differ; zeros fill the rest up to a multiple of
     64."""
-    sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], dtype=torch.float64).sqrt()
+    sums = rows.double() @ torch.linspace(1.0, 2.0, rows.shape[1], **DOUBLES).sqrt()
     if len(sums[: 2 * most].unique()) > most:
         return None
     ordered, order = sums.sort(stable=True)

@@ -41,6 +41,7 @@ from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import FLOATS
 
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
@@ -89,7 +90,7 @@ def sog_bytes_like(scene: Gaussians) -> Callable[[int], int]:
         return lambda count: round(fixed + each * count)
     rows, most = scene.features_rest.flatten(1), palette_size(len(scene))
     members, pieces = min(round(256 * max(len(rows) / most, 1)), len(rows)), []
-    for middle in rows[torch.linspace(0, len(rows) - 1, 4).long()]:
+    for middle in rows[torch.linspace(0, len(rows) - 1, 4, **FLOATS).long()]:
         near = (rows - middle).square().sum(dim=1).topk(min(2 * members, len(rows)), largest=False).indices[::2]
         pieces.append(palette(rows[near], lambda share: None, 256)[0])
     pixels = codebook(torch.cat(pieces))[1].reshape(-1, 3).numpy()

@@ -39,6 +39,7 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.io.turning import turned
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import DOUBLES
 
 Version = Literal[3, 4]
 
@@ -120,7 +121,7 @@ def _named_axes(head: _Head, data: bytes, path: Path) -> Tensor | None:
             number = int(content.view("<u4")[0]) if kind == _AXES_EXTENSION and size == 4 else 0
             if 1 <= number <= len(_AXES):
                 columns = [_DIRECTIONS[letter] for letter in _AXES[number - 1]]
-                found = torch.tensor(columns, dtype=torch.float64).T
+                found = torch.tensor(columns, **DOUBLES).T
             else:
                 unread[f"{kind:#x}"] = None
     if unread:

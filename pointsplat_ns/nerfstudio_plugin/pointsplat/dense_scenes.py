@@ -29,6 +29,7 @@ from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
@@ -107,7 +108,7 @@ class DenseScene:
     @property
     def background(self) -> Tensor:
         """Background colour (3,) in [0, 1]."""
-        return torch.zeros(3)
+        return torch.zeros(3, **FLOATS)
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the file, onto the CPU."""

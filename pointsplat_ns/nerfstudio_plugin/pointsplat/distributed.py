@@ -8,7 +8,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from pointsplat_ns.refiner.encoder import BatchNorm
+from pointsplat_ns.refiner.layers import BatchNorm
 from pointsplat_ns.system.processes import world_size
 
 

@@ -191,7 +191,7 @@ class PointSplatModel(SplatfactoModel):
     def _drawn_keep(self) -> float | None:
         """The budget of a training step, drawn at random if there are several; None is the config's ``keep``."""
         keeps = (self.config.keep, *self.config.more_keeps)
-        return keeps[int(torch.randint(len(keeps), ()))] if len(keeps) > 1 else None
+        return keeps[int(torch.randint(len(keeps), (), device="cpu"))] if len(keeps) > 1 else None
 
     def timed_refine(self, index: int) -> tuple[Gaussians, float]:
         """As :meth:`refine` in evaluation, but not from the cache, and the seconds that it took."""

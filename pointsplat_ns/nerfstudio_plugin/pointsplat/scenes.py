@@ -28,6 +28,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
 
 
@@ -101,7 +102,7 @@ class TrainedScene(DenseScene):
     def background(self) -> torch.Tensor:
         """Background colour (3,), in [0, 1], that the run is evaluated with."""
         color = self.run.model_fields.get("background_color")
-        return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND)
+        return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND, **FLOATS)
 
     @cached_property
     def _dataparser(self) -> DataParser:

@@ -79,9 +79,9 @@ class CappedStrategy(Strategy):
         if dead.all():
             return
         count = next_count(num, self.most, (self.full_from - 1 - step) // self.every)
-        places = torch.cat([dead.nonzero()[:, 0], torch.arange(num, count, device=dead.device)])
+        places = torch.cat([dead.nonzero()[:, 0], torch.arange(num, count, device=dead.device, dtype=torch.int64)])
         sources = drawn(opacities.masked_fill(dead, 0.0), len(places))
-        rows = torch.arange(count, device=dead.device)
+        rows = torch.arange(count, device=dead.device, dtype=torch.int64)
         rows[places] = sources
         changed = torch.cat([sources.unique(), places])
         copies = 1 + torch.bincount(sources, minlength=num)[rows[changed]]

@@ -44,6 +44,7 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
 )
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.kernels import Kernels
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
 
@@ -157,7 +158,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         self.step = 0
         self.crop_box: OrientedBox | None = None
         self.background_color = (
-            torch.tensor(VIEWER_BACKGROUND)
+            torch.tensor(VIEWER_BACKGROUND, **FLOATS)
             if config.background_color == "random"
             else get_color(config.background_color)
         )
@@ -174,7 +175,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         num_rest = (self.config.sh_degree + 1) ** 2 - 1
         quats = random_quat_tensor(num)
         if len(colors) == 0:
-            features_dc = torch.rand(num, 3)
+            features_dc = torch.rand(num, 3, **FLOATS)
         elif self.config.sh_degree > 0:
             features_dc = RGB2SH(colors / 255)
         else:  # colours are optimised as logits
@@ -184,8 +185,8 @@ class SplatfactoCpuModel(SplatfactoModel):
             "scales": distance_to_others(points, 3).log().repeat(1, 3),
             "quats": quats,
             "features_dc": features_dc,
-            "features_rest": torch.zeros(num, num_rest, 3),
-            "opacities": torch.full((num, 1), math.log(0.1 / 0.9)),
+            "features_rest": torch.zeros(num, num_rest, 3, **FLOATS),
+            "opacities": torch.full((num, 1), math.log(0.1 / 0.9), **FLOATS),
         }
         return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
 

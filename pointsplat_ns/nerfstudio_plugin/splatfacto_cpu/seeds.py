@@ -9,11 +9,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pointsplat_ns.geometry.neighbours import nearest
+from pointsplat_ns.system.tensors import FLOATS
 
 
 def random_seeds(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) in a cube around the origin, and no colours (0, 3), as Splatfacto starts without seed points."""
-    return (torch.rand(config.num_random, 3) - 0.5) * config.random_scale, torch.zeros(0, 3)
+    return (torch.rand(config.num_random, 3, **FLOATS) - 0.5) * config.random_scale, torch.zeros(0, 3, **FLOATS)
 
 
 def random_seeds_near_cameras(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
@@ -24,16 +25,16 @@ def random_seeds_near_cameras(config: SplatfactoModelConfig) -> tuple[Tensor, Te
     gains 1.5 dB in 800 steps (fox, which has no seed points).
     """
     reach = max(1.0, config.random_scale / 2)
-    contracted = (2 - 1 / reach) * torch.rand(config.num_random, 1) ** (1 / 3)
+    contracted = (2 - 1 / reach) * torch.rand(config.num_random, 1, **FLOATS) ** (1 / 3)
     distances = torch.where(contracted < 1, contracted, 1 / (2 - contracted))
-    return distances * normalize(torch.randn(config.num_random, 3), dim=1), torch.zeros(0, 3)
+    return distances * normalize(torch.randn(config.num_random, 3, **FLOATS), dim=1), torch.zeros(0, 3, **FLOATS)
 
 
 def at_most(most: int | None, points: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
     """At most so many positions (N, 3), chosen at random, and their colours."""
     if most is None or len(points) <= most:
         return points, colors
-    chosen = torch.randperm(len(points))[:most]
+    chosen = torch.randperm(len(points), device="cpu")[:most]
     return points[chosen], colors[chosen] if len(colors) > 0 else colors
 
 
@@ -45,7 +46,7 @@ def distance_to_others(points: Tensor, k: int) -> Tensor:
     """
     places, place_of = torch.unique(points, dim=0, return_inverse=True)
     if len(places) < 2:
-        return torch.full((len(points), 1), 0.01)
+        return torch.full((len(points), 1), 0.01, **FLOATS)
     distances = nearest(places, k + 1)[0][:, 1:]
     missing = distances[:, -1:].expand(-1, k - distances.shape[1])
     # Distinct positions can be so close that the distance is zero in float32.

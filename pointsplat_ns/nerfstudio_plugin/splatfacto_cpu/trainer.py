@@ -28,6 +28,7 @@ from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
+from pointsplat_ns.system.tensors import FLOATS
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
@@ -259,4 +260,4 @@ def tiny_as_zero() -> Iterator[None]:
 
 def takes_tiny_as_zero() -> bool:
     """Whether this thread takes floats below the smallest normal one as 0."""
-    return not torch.tensor(1e-30).mul(1e-10).item()
+    return not torch.tensor(1e-30, **FLOATS).mul(1e-10).item()

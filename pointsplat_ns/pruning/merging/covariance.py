@@ -16,6 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import in_pieces
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import most_threads
 
 MIN_DIVISOR = 1e-300
@@ -88,7 +89,7 @@ def thinnest_axes(six: Tensor) -> Tensor:
         matrix = matrix / matrix.diagonal(dim1=1, dim2=2).sum(1).clamp_min(MIN_DIVISOR)[:, None, None]
         matrix = matrix @ matrix
     column = matrix.diagonal(dim1=1, dim2=2).argmax(1)
-    vector = matrix[torch.arange(len(matrix), device=six.device), column]
+    vector = matrix[torch.arange(len(matrix), device=six.device, dtype=torch.int64), column]
     length = vector.norm(dim=1, keepdim=True)
     return torch.where(length > MIN_DIVISOR, vector / length.clamp_min(MIN_DIVISOR), vector.new_tensor([0.0, 0.0, 1.0]))
 
@@ -96,7 +97,7 @@ def thinnest_axes(six: Tensor) -> Tensor:
 def plane_axes(normal: Tensor) -> tuple[Tensor, Tensor]:
     """Two unit vectors (N, 3) that span the plane perpendicular to each unit normal (Duff et al. 2017, JCGT 6(1))."""
     x, y, z = normal.unbind(1)
-    sign = torch.where(z >= 0, 1.0, -1.0).to(normal)
+    sign = torch.where(z >= 0, torch.ones_like(z), -1.0)
     a = -1 / (sign + z)
     b = x * y * a
     return (
@@ -135,7 +136,7 @@ def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 def _by_kernels(log_scales: Tensor, quats: Tensor, rows: Tensor) -> Tensor:
     """As :func:`covariances`, (m, 6), for the rows (m,) of float32 log-scales and quaternions."""
-    cov = torch.empty(len(rows), 6, dtype=torch.float64)
+    cov = torch.empty(len(rows), 6, **DOUBLES)
     task = KERNELS.structs["Shapes"](
         log_scales=log_scales.contiguous(), quats=quats.contiguous(), rows=rows.contiguous(), count=len(rows), cov=cov
     )
@@ -145,9 +146,9 @@ def _by_kernels(log_scales: Tensor, quats: Tensor, rows: Tensor) -> Tensor:
 
 def _as_torch() -> bool:
     """Whether the kernel computes the covariances of some Gaussians as torch does."""
-    log_scales, quats = torch.randn(90, 7, generator=torch.Generator().manual_seed(0)).split([3, 4], dim=1)
+    log_scales, quats = torch.randn(90, 7, generator=torch.Generator().manual_seed(0), **FLOATS).split([3, 4], dim=1)
     torchs = covariances(log_scales[::2].double(), quats[::2].double())
-    return torch.allclose(_by_kernels(log_scales, quats, torch.arange(0, 90, 2)), torchs, rtol=1e-9)
+    return torch.allclose(_by_kernels(log_scales, quats, torch.arange(0, 90, 2, **INDICES)), torchs, rtol=1e-9)
 
 
 KERNELS = Kernels("merging", Path(__file__).with_name("covariance.cpp"), _as_torch)

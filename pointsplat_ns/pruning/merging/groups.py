@@ -10,6 +10,7 @@ from torch import Tensor
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.pruning.merging.tree import Tree
+from pointsplat_ns.system.tensors import INDICES
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Groups:
         """The groups in the order of their first members."""
         order = self.first.argsort()
         rank = torch.empty_like(order)
-        rank[order] = torch.arange(len(order))
+        rank[order] = torch.arange(len(order), **INDICES)
         ordered = (values[order] for values in (self.first, self.means, self.cov, self.alphas, self.counts))
         return Groups(rank[self.group], self.shares, *ordered)
 
@@ -55,5 +56,5 @@ def merged_groups(participants: Participants, state: State, tree: Tree) -> Group
 
 def first_members(participants: Participants, group: Tensor, count: int) -> Tensor:
     """Index in the scene of the first member of each of ``count`` groups, (K,) int64."""
-    first = torch.full((count,), len(participants.scene))
+    first = torch.full((count,), len(participants.scene), **INDICES)
     return first.scatter_reduce_(0, group, participants.members, "amin")

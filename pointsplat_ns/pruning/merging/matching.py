@@ -12,6 +12,7 @@ from torch import Tensor
 from pointsplat_ns.pruning.merging.settings import MERGING
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 
@@ -52,11 +53,11 @@ def _candidates(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tenso
     """The pairs that all passes take: first and second members, (E,) int64 each, and costs, (E,) float32."""
     n = len(near)
     costs = _symmetric(near, costs)
-    free = torch.ones(n, dtype=torch.bool)
-    rows = torch.arange(n)
+    free = torch.ones(n, **FLAGS)
+    rows = torch.arange(n, **INDICES)
     firsts, seconds, prices = [], [], []
     for _ in range(passes):
-        best = torch.full((n,), torch.iinfo(torch.int64).max)
+        best = torch.full((n,), torch.iinfo(torch.int64).max, **INDICES)
         for these in rows.split(CHUNK):
             keys = _keys(these, costs)
             best[these] = torch.minimum(best[these], keys.amin(1))
@@ -82,7 +83,7 @@ def _candidates(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tenso
         if len(rows) == 0:
             break
     if not firsts:
-        return torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64), torch.empty(0)
+        return torch.empty(0, **INDICES), torch.empty(0, **INDICES), torch.empty(0, **FLOATS)
     return torch.cat(firsts), torch.cat(seconds), torch.cat(prices)
 
 
@@ -99,7 +100,7 @@ def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
         mine = costs[me].where(~both, mean.where(others > me[:, None], math.inf))
         result[me] = mine.where(others != me[:, None], math.inf).nan_to_num(nan=math.inf, posinf=math.inf)
 
-    in_threads(fill, torch.arange(len(near)).split(CHUNK))
+    in_threads(fill, torch.arange(len(near), **INDICES).split(CHUNK))
     return result
 
 
@@ -107,7 +108,7 @@ def _keys(rows: Tensor, costs: Tensor) -> Tensor:
     """Numbers (m, k) int64 that are ordered as the costs of rows (m,), all different: the bits of a float32 that is not
     negative are ordered as the float is."""
     k = costs.shape[1]
-    numbers = rows[:, None] * k + torch.arange(k)
+    numbers = rows[:, None] * k + torch.arange(k, **INDICES)
     # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
     return (costs[rows].view(torch.int32).long() << 32) | ((numbers * 2654435761) & 0xFFFFFFFF)
 
@@ -115,11 +116,11 @@ def _keys(rows: Tensor, costs: Tensor) -> Tensor:
 def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`_candidates`, to the bit; overwrites the costs."""
     n, k = near.shape
-    pairs = [torch.empty(n // 2, dtype=dtype) for dtype in (torch.int64, torch.int64, torch.float32)]
-    found = torch.zeros(1, dtype=torch.int64)
+    pairs = [torch.empty(n // 2, dtype=dtype, device="cpu") for dtype in (torch.int64, torch.int64, torch.float32)]
+    found = torch.zeros(1, **INDICES)
     task = KERNELS.structs["Matching"](
         near=near.contiguous(), costs=costs.contiguous(), count=n, neighbours=k,
-        passes=passes, best=torch.empty(n, dtype=torch.int64), rows=torch.arange(n), found=found,
+        passes=passes, best=torch.empty(n, **INDICES), rows=torch.arange(n, **INDICES), found=found,
         **dict(zip(("firsts", "seconds", "prices"), pairs, strict=True)),
     )  # fmt: skip
     for larger in (1, 0):
@@ -132,8 +133,9 @@ def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tenso
 def _as_torch() -> bool:
     """Whether the kernels find some pairs as torch does."""
     generator = torch.Generator().manual_seed(0)
-    near = ((torch.arange(200)[:, None] + torch.tensor([-9, -2, -1, 1, 2, 5])) % 200).to(torch.int32)
-    costs = torch.randint(9, (200, 6), generator=generator).float()  # many of them equal
+    offsets = torch.tensor([-9, -2, -1, 1, 2, 5], **INDICES)
+    near = ((torch.arange(200, **INDICES)[:, None] + offsets) % 200).to(torch.int32)
+    costs = torch.randint(9, (200, 6), generator=generator, device="cpu").float()  # many of them equal
     found = [function(near, costs.clone(), 4) for function in (_by_kernels, _candidates)]
     return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 

@@ -15,6 +15,7 @@ from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 
 def scene_maker(participants: Participants, groups: Groups, settings: MergeSettings) -> Callable[[float], Gaussians]:
@@ -55,8 +56,8 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
     wide = torch.promote_types(scene.dtype, torch.float32)
     means = []
     for values in (scene.features_dc, scene.features_rest):
-        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide)
-        for rows in torch.arange(len(group)).split(CHUNK):
+        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device="cpu")
+        for rows in torch.arange(len(group), **INDICES).split(CHUNK):
             own = values[participants.members[rows]].to(wide)
             mean.index_add_(0, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
             of_single = single[group[rows]]
@@ -67,8 +68,8 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
 
 def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
-    scales, quats = torch.empty(len(cov), 3, dtype=torch.float64), torch.empty(len(cov), 4, dtype=dtype)
-    for rows in torch.arange(len(cov)).split(CHUNK):
+    scales, quats = torch.empty(len(cov), 3, **DOUBLES), torch.empty(len(cov), 4, dtype=dtype, device="cpu")
+    for rows in torch.arange(len(cov), **INDICES).split(CHUNK):
         variances, axes = torch.linalg.eigh(unpack(cov[rows]))
         axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
         # as covariances(): rounding leaves nothing of what is thinner

@@ -46,6 +46,7 @@ from pointsplat_ns.pruning.merging.replacement import growth
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 GAUSSIANS_AT_ONCE = 1 << 14
@@ -76,15 +77,15 @@ def pair_costs(
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
     n = len(state)
-    directions = torch.empty(n, 3, dtype=torch.uint8)
-    everyone = torch.arange(n).split(GAUSSIANS_AT_ONCE)
+    directions = torch.empty(n, 3, dtype=torch.uint8, device="cpu")
+    everyone = torch.arange(n, **INDICES).split(GAUSSIANS_AT_ONCE)
 
     def choose(rows: Tensor) -> None:
         directions[rows] = directions_of(state, rows).to(torch.uint8)
 
     in_threads(choose, everyone)
     projections = Projections.empty(state, dtype)
-    costs = torch.zeros(near.shape, dtype=dtype)
+    costs = torch.zeros(near.shape, dtype=dtype, device="cpu")
     for direction in range(len(DIRECTIONS)):
         compared = (directions == direction).any(1).nonzero()[:, 0]
         if len(compared) == 0:
@@ -232,12 +233,12 @@ def _changes(
 def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     """As :func:`pair_costs`, float32."""
     count, library = len(state), KERNELS.library
-    costs = torch.empty(near.shape, dtype=torch.float32)
+    costs = torch.empty(near.shape, **FLOATS)
     limits = KERNELS.structs["Limits"](**vars(PROJECTION_LIMITS))
     task = KERNELS.structs["Costs"](
         planes=_planes(), limits=limits, contrasts=_contrasts(settings), means=state.means, cov=state.cov,
         alphas=state.alphas, colours=state.colours.contiguous(), weights=state.weights, count=count,
-        axes=state.colours.shape[1], neighbours=near.shape[1], table=torch.empty(count, 12, dtype=torch.float32),
+        axes=state.colours.shape[1], neighbours=near.shape[1], table=torch.empty(count, 12, **FLOATS),
         near=near.contiguous(), costs=costs,
     )  # fmt: skip
     for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
@@ -262,16 +263,16 @@ def _as_torch() -> bool:
     count = 90
 
     def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, **FLOATS)
 
     factors = 0.1 * random(count, 3, 3)
     cov = (factors @ factors.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     state = State(
         means=random(count, 3) - 0.5, cov=cov, alphas=random(count), colours=random(count, 5),
-        weights=random(count), counts=torch.ones(count, dtype=torch.int32),
-        centre=torch.zeros(3, dtype=torch.float64), size=1.0,
+        weights=random(count), counts=torch.ones(count, dtype=torch.int32, device="cpu"),
+        centre=torch.zeros(3, **DOUBLES), size=1.0,
     )  # fmt: skip
-    near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32)
+    near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32, device="cpu")
     ours, torchs = _by_kernels(state, near, MERGING), pair_costs(state, near, compiled=False)
     return agreement([ours], [torchs], off=1e-4, share=1e-2)
 

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from pointsplat_ns.pruning.merging.covariance import plane_axes
 from pointsplat_ns.pruning.merging.state import State
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 DIRECTIONS = torch.nn.functional.normalize(
-    torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if way > (0, 0, 0)], dtype=torch.float64)
+    torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if way > (0, 0, 0)], **DOUBLES)
 )
 """Unit vectors (13, 3)."""
 
@@ -69,7 +70,7 @@ def _perpendicular_triples() -> Tensor:
         second = int(cosines[first].sort(stable=True).indices[0])
         third = int((cosines[first] + cosines[second]).sort(stable=True).indices[0])
         rows.append([first, second, third])
-    return torch.tensor(rows)
+    return torch.tensor(rows, **INDICES)
 
 
 PLANE_AXES, TO_PLANE = _projection_matrices()
@@ -105,7 +106,7 @@ class Projections:
     @classmethod
     def empty(cls, state: State, dtype: torch.dtype) -> Projections:
         """The columns that do not depend on the direction; :meth:`fill` writes the others."""
-        table, colours = torch.empty(len(state), 8, dtype=dtype), state.colours.to(dtype)
+        table, colours = torch.empty(len(state), 8, dtype=dtype, device="cpu"), state.colours.to(dtype)
         table[:, 6], table[:, 7] = state.alphas, colours.square().sum(1)
         return cls(table, colours)
 

@@ -32,6 +32,7 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import bounded_colours
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 from pointsplat_ns.system.threads import most_threads
 
 
@@ -47,7 +48,7 @@ class Members:
 
     def __init__(self, scene: Gaussians, rows: Tensor, settings: MergeSettings = MERGING):
         self._scene, self._rows, self._settings = scene, rows, settings
-        self.masses = torch.empty(len(rows), dtype=torch.float64)
+        self.masses = torch.empty(len(rows), **DOUBLES)
         """Opacity times root mean square area, (n,)."""
         for these in self.pieces():
             some = rows[these]
@@ -98,7 +99,9 @@ class Moments:
     def shares(self, masses: Tensor, group: Tensor) -> Tensor:
         """Shares (m,) float64 of members with masses (m,) in the mass of their groups (m,)."""
         total = self.mass[group]
-        return torch.where(total > MIN_DIVISOR, masses / total.clamp_min(MIN_DIVISOR), 1 / self.sizes[group])
+        return torch.where(
+            total > MIN_DIVISOR, masses / total.clamp_min(MIN_DIVISOR), 1 / self.sizes[group].to(masses.dtype)
+        )
 
 
 def regrouped(
@@ -126,7 +129,9 @@ def regrouped(
         common.mass > MIN_DIVISOR, ratios * common.mass / areas_of(common.cov).clamp_min(MIN_DIVISOR), alphas
     )
     shares = in_pieces(
-        lambda these: common.shares(members.masses[these], group[these]), torch.arange(len(group)), dtype=torch.float32
+        lambda these: common.shares(members.masses[these], group[these]),
+        torch.arange(len(group), **INDICES),
+        dtype=torch.float32,
     )
     return Groups(
         group,
@@ -141,7 +146,7 @@ def regrouped(
 
 def areas_of(cov: Tensor) -> Tensor:
     """Root mean square areas (K,) of covariances (K, 6), computed in pieces."""
-    return in_pieces(lambda these: rms_area(cov[these]), torch.arange(len(cov)))
+    return in_pieces(lambda these: rms_area(cov[these]), torch.arange(len(cov), **INDICES))
 
 
 def group_moments(members: Members, group: Tensor, count: int) -> Moments:
@@ -154,7 +159,7 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
     """
 
     def zeros(*shape: int) -> Tensor:
-        return torch.zeros(count, *shape, dtype=torch.float64)
+        return torch.zeros(count, *shape, **DOUBLES)
 
     mass, sizes = zeros().index_add_(0, group, members.masses), torch.bincount(group, minlength=count)
     found = Moments(mass, sizes, zeros(3), zeros(6), zeros(3))
@@ -196,7 +201,7 @@ def best_groups(
             result[these] = _by_kernels(piece, own, near, fits)
         else:
             result[these] = fits.best_of(piece, torch.cat([own[:, None], near.long()], dim=1))
-    heaviest = torch.zeros(len(groups.mass), dtype=torch.float64).scatter_reduce_(0, group, members.masses, "amax")
+    heaviest = torch.zeros(len(groups.mass), **DOUBLES).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
 
 
@@ -216,10 +221,10 @@ class Fits:
         """The groups with some moments."""
         inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
         occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
-        for these in torch.arange(len(groups.mass)).split(CHUNK):
+        for these in torch.arange(len(groups.mass), **INDICES).split(CHUNK):
             cov = groups.cov[these]
             variance = cov[:, (0, 3, 5)].mean(1).clamp_min(MIN_DIVISOR)
-            shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, dtype=torch.float64)  # invertible if flat
+            shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES)  # invertible if flat
             inverse[these] = pack(torch.linalg.inv(shapes)) * (occurrences / variance[:, None])
             log_determinants[these] = torch.logdet(shapes) + 3 * variance.log()
         return cls(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
@@ -252,11 +257,11 @@ def _as_torch() -> bool:
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+        return torch.rand(*shape, generator=generator, **DOUBLES)
 
     piece = Piece(random(90, 3), random(90, 6), random(90, 3).float())
     fits = Fits(random(9, 3), random(9, 6), random(9), random(9, 3), 2.0)
-    group, near = (torch.randint(9, shape, generator=generator) for shape in ((90,), (90, 4)))
+    group, near = (torch.randint(9, shape, generator=generator, device="cpu") for shape in ((90,), (90, 4)))
     torchs = fits.best_of(piece, torch.cat([group[:, None], near], dim=1))
     return torch.equal(_by_kernels(piece, group, near.int(), fits), torchs)
 

@@ -36,6 +36,7 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, bounded
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import most_threads
 
 
@@ -55,7 +56,7 @@ def replace_pairs(
     """
     if KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, first, second, settings)
-    stays = torch.ones(len(state), dtype=torch.bool)
+    stays = torch.ones(len(state), **FLAGS)
     stays[second] = False
     place = stays.cumsum(0) - 1
     after = replace(
@@ -67,8 +68,8 @@ def replace_pairs(
         weights=state.weights[stays],
         counts=state.counts[stays],
     )
-    shares = torch.empty(len(first))
-    for part in torch.arange(len(first)).split(CHUNK):
+    shares = torch.empty(len(first), **FLOATS)
+    for part in torch.arange(len(first), **INDICES).split(CHUNK):
         i, j = first[part], second[part]
         k = place[i]
         wi, *replacements = _replacements(state, i, j, settings)
@@ -116,15 +117,15 @@ def growth(alphas: Tensor, settings: MergeSettings) -> Tensor:
 def _by_kernels(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Tensor]:
     """As :func:`replace_pairs`."""
     n, count = len(state), len(state) - len(first)
-    partner = torch.full((n,), -1)
+    partner = torch.full((n,), -1, **INDICES)
     partner[first] = second
-    stays = torch.ones(n, dtype=torch.bool)
+    stays = torch.ones(n, **FLAGS)
     stays[second] = False
     source = stays.nonzero()[:, 0]
     names = ("means", "cov", "alphas", "colours", "weights", "counts")
     before = {name: getattr(state, name).contiguous() for name in names}
     after = {name: values.new_empty(count, *values.shape[1:]) for name, values in before.items()}
-    shares = torch.empty(count)
+    shares = torch.empty(count, **FLOATS)
     remaining = KERNELS.structs["Remaining"]
     task = KERNELS.structs["Replacing"](
         before=remaining(**before), after=remaining(**after), source=source, partner=partner[source], count=count,
@@ -140,14 +141,14 @@ def _as_torch() -> bool:
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, **FLOATS)
 
     factors = random(90, 3, 3)
     state = State(
         random(90, 3), pack(factors @ factors.mT).contiguous(), random(90), random(90, 5), random(90),
-        torch.ones(90, dtype=torch.int32), torch.zeros(3), 1.0,
+        torch.ones(90, dtype=torch.int32, device="cpu"), torch.zeros(3, **FLOATS), 1.0,
     )  # fmt: skip
-    first, second = torch.randperm(90, generator=generator)[:60].view(2, 30)
+    first, second = torch.randperm(90, generator=generator, device="cpu")[:60].view(2, 30)
     found = [_by_kernels(state, first, second, MERGING), replace_pairs(state, first, second, MERGING, False)]
     ours, torchs = ([after.means, after.cov, after.alphas, after.colours, shares] for after, shares in found)
     return all(torch.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(ours, torchs, strict=True))

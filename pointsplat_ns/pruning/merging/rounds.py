@@ -36,6 +36,7 @@ from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
 from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
+from pointsplat_ns.system.tensors import INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -172,7 +173,7 @@ def _levels(
     n = len(scene)
     if n in counts:
         report(0.0 if len(counts) > 1 else 1.0)
-        yield Merged(scene, torch.arange(n, device=scene.device), Finish())
+        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64), Finish())
         counts = counts[1:]
     if not counts:
         return
@@ -203,7 +204,7 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
     """The result after some rounds, on a device; ``last`` as for :func:`finished`."""
     with one_thread_each():
         group, scene, finish = finished(step, regroup, settings, last)
-    assignment = torch.full((len(step.participants.scene),), -1)
+    assignment = torch.full((len(step.participants.scene),), -1, **INDICES)
     assignment[step.participants.members] = group
     if step.index is not None:
         assignment = assignment[step.index]

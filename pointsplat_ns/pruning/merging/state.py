@@ -14,6 +14,7 @@ from pointsplat_ns.pruning.merging.covariance import covariances_of
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 def bounded(cov: Tensor) -> Tensor:
@@ -77,7 +78,7 @@ def initial_state(
         alphas=torch.sigmoid(scene.opacities[members, 0]).to(dtype),
         colours=_on_axes(scene, members, axes or principal_axes(scene, members, settings), settings),
         weights=weights.float(),
-        counts=torch.ones(len(members), dtype=torch.int32),
+        counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
         centre=centre,
         size=size,
     )
@@ -100,7 +101,7 @@ def principal_axes(scene: Gaussians, members: Tensor, settings: MergeSettings) -
     pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
     shift = _coefficients(scene, pieces[0], settings).mean(0)  # near the mean, so that float32 holds the squares
-    total, products = torch.zeros(width, dtype=torch.float64), torch.zeros(width, width, dtype=torch.float64)
+    total, products = torch.zeros(width, **DOUBLES), torch.zeros(width, width, **DOUBLES)
     for rows in pieces:
         values = _coefficients(scene, rows, settings) - shift
         total += values.sum(0)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
@@ -20,7 +22,7 @@ class Tree:
     @classmethod
     def of_single(cls, n: int) -> Tree:
         """The tree before the first round."""
-        return cls(torch.arange(n, dtype=torch.int32), torch.arange(n))
+        return cls(torch.arange(n, dtype=torch.int32, device="cpu"), torch.arange(n, **INDICES))
 
     def after_round(self, first: Tensor, second: Tensor, shares: Tensor) -> Tree:
         """The tree after another round.
@@ -29,7 +31,7 @@ class Tree:
             first, second: (E,) each, indices of the members of its pairs among those that remain.
             shares: (E,) float32, of the first in the mass of each pair.
         """
-        stays = torch.ones(len(self.remaining), dtype=torch.bool)
+        stays = torch.ones(len(self.remaining), **FLAGS)
         stays[second] = False
         i, j = (self.remaining[these].to(torch.int32) for these in (first, second))
         parents = self.parents.clone()
@@ -41,14 +43,14 @@ class Tree:
         roots = self.parents
         while not torch.equal(above := roots[roots.long()], roots):
             roots = above
-        group = torch.empty(len(roots), dtype=torch.int64)
-        group[self.remaining] = torch.arange(len(self.remaining))
+        group = torch.empty(len(roots), **INDICES)
+        group[self.remaining] = torch.arange(len(self.remaining), **INDICES)
         return group[roots.long()]
 
     def shares(self) -> Tensor:
         """Share of each in the mass of the Gaussian that it is part of, (n,) float32: the product of its shares in all
         rounds, from the last to the first."""
-        shares = torch.ones(len(self.parents))
+        shares = torch.ones(len(self.parents), **FLOATS)
         for first, second, share in reversed(self.rounds):
             i, j = first.long(), second.long()
             shares[j] = shares[i] * (1 - share)

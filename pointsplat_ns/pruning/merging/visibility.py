@@ -28,6 +28,7 @@ from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.pruning.merging.participants import Participants
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
 
 
@@ -36,9 +37,9 @@ def visibility_weights(participants: Participants, viewpoints: Viewpoints | None
     one of several participants along the curve is drawn for all of them."""
     scene, members = participants.scene, participants.members
     if viewpoints is None:
-        return torch.ones(len(members))
+        return torch.ones(len(members), **FLOATS)
     step = -(-len(members) // settings.max_count_drawn)
-    rows = members if step == 1 else torch.arange(-(-len(members) // step))
+    rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
     drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
     weights = covered_per_area(drawn, rows, participants.views_in_units(viewpoints.views), settings)
     weights = weights.repeat_interleave(step)[: len(members)]
@@ -57,7 +58,7 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
     """
-    covered = torch.zeros(len(scene), dtype=torch.float64)
+    covered = torch.zeros(len(scene), **DOUBLES)
     small = views.spread(settings.visibility_views).resized(settings.visibility_side)
     small = replace(small, rasterize_mode="antialiased")
     for pixels in each_view(list(small), len(scene), lambda view: pixels_of(scene, view)):
@@ -67,7 +68,7 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
     well_seen = ratios.sort().values[int(settings.well_seen_quantile * (len(ratios) - 1))]
     if not 0 < float(well_seen) < math.inf:
-        return torch.ones(len(ratios))
+        return torch.ones(len(ratios), **FLOATS)
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()
 
 

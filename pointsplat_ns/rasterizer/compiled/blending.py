@@ -20,6 +20,7 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, Region, TileList
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 class KernelInputs(NamedTuple):
@@ -117,7 +118,7 @@ def blend_region(
 def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
     """Blending weight of each of ``count`` Gaussians, summed over pixels, (count,). The table of the task is without
     colours; ``pairs`` (P,) are rows of it."""
-    sums = torch.empty(pairs.numel())
+    sums = torch.empty(pairs.numel(), **FLOATS)
     task.fill(sums=sums)
     on_threads(len(sums) >= SEVERAL, KERNELS.library.pointsplat_weigh, task)
     # one thread, in the order of the tiles
@@ -148,8 +149,8 @@ def differentiate_region(
 
     # the sum of each Gaussian's pairs, in the order of its tiles
     by_gaussian = torch.empty_like(tiles.places)
-    by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs))
-    starts = torch.zeros(count + 1, dtype=torch.int64)
+    by_gaussian.index_copy_(0, tiles.places, torch.arange(pairs, **INDICES))
+    starts = torch.zeros(count + 1, **INDICES)
     torch.cumsum(tiles.counts, 0, out=starts[1:])
     on_threads(pairs >= SEVERAL, library.pointsplat_gather, sums, by_gaussian, starts, tiles.order, count, columns, out)
     return out
@@ -162,12 +163,12 @@ def _as_torch() -> bool:
     count, width, height = 90, 21, 18
 
     def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, **FLOATS)
 
-    means2d = random(count, 2) * torch.tensor([width, height])
-    cov2d = torch.tensor([0.3, 0.0, 0.3]) + random(count, 1) * torch.tensor([9.0, 4.0, 5.0])
+    means2d = random(count, 2) * torch.tensor([width, height], **INDICES)
+    cov2d = torch.tensor([0.3, 0.0, 0.3], **FLOATS) + random(count, 1) * torch.tensor([9.0, 4.0, 5.0], **FLOATS)
     det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
-    depths, cameras = random(count), torch.zeros(count, dtype=torch.int64)
+    depths, cameras = random(count), torch.zeros(count, **INDICES)
     footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
     number = footprints.rows * footprints.columns
     grads = random(number, 3, PIXELS), random(number, PIXELS)
@@ -175,7 +176,7 @@ def _as_torch() -> bool:
     drawn = []
     tiles = footprints.tiles(footprints.whole)
     for engine in (blocks, sys.modules[__name__]):
-        image, final = torch.empty(number, 3, PIXELS), torch.empty(number, PIXELS)
+        image, final = torch.empty(number, 3, PIXELS, **FLOATS), torch.empty(number, PIXELS, **FLOATS)
         inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, Quality())
         tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
         summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)

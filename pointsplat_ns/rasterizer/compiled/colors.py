@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer.spherical_harmonics import Color
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 class CompiledColor(torch.autograd.Function):
@@ -85,8 +86,8 @@ def _call(task: Struct) -> None:
 def _as_torch() -> bool:
     """Whether the kernels give the colours of some coefficients, together and apart, with gradients, as torch does."""
     generator = torch.Generator().manual_seed(0)
-    coefficients, ids = torch.randn(60, 17, 3, generator=generator), torch.arange(0, 60, 2)
-    directions, weights = (torch.randn(30, 3, generator=generator) for _ in range(2))
+    coefficients, ids = torch.randn(60, 17, 3, generator=generator, **FLOATS), torch.arange(0, 60, 2, **INDICES)
+    directions, weights = (torch.randn(30, 3, generator=generator, **FLOATS) for _ in range(2))
 
     def together(along: Tensor, coefficients: Tensor, ids: Tensor, degree: int) -> Tensor:
         return CompiledColor.apply(along, coefficients, None, ids, degree)

@@ -16,6 +16,7 @@ from pointsplat_ns.rasterizer import ewa
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN
 from pointsplat_ns.rasterizer.ewa import Lens
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 
 
 def camera_struct(kernels: Kernels, view: Tensor, centre: Tensor, lens: Lens) -> Struct:
@@ -42,7 +43,7 @@ def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: T
     library = KERNELS.library
     tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
     ranges = -(-len(means) // library.pointsplat_range())
-    counts = torch.empty(ranges, dtype=torch.int64)
+    counts = torch.empty(ranges, **INDICES)
     on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, scene_struct(KERNELS, *tensors), counts)
     return int(counts.sum())
 
@@ -56,21 +57,21 @@ class CompiledProject(torch.autograd.Function):
         scene = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
         count = means.shape[0]
         ranges = -(-count // library.pointsplat_range())
-        counts, nearest = torch.empty(ranges, dtype=torch.int64), torch.empty(ranges, dtype=torch.float64)
-        seen = torch.empty(count, library.pointsplat_seen(), dtype=torch.uint8)
+        counts, nearest = torch.empty(ranges, **INDICES), torch.empty(ranges, **DOUBLES)
+        seen = torch.empty(count, library.pointsplat_seen(), dtype=torch.uint8, device="cpu")
         camera = camera_struct(KERNELS, view, centre, lens)
         task = KERNELS.structs["Projection"](
             camera=camera, scene=scene_struct(KERNELS, *scene), seen=seen, counts=counts, nearest=nearest
         )
         on_threads(count >= SEVERAL, library.pointsplat_project, task)
 
-        offsets = torch.zeros(ranges + 1, dtype=torch.int64)
+        offsets = torch.zeros(ranges + 1, **INDICES)
         torch.cumsum(counts, 0, out=offsets[1:])
         kept = int(offsets[-1])
-        ids = torch.empty(kept, dtype=torch.int64)
+        ids = torch.empty(kept, **INDICES)
         means2d, cov2d, directions = (means.new_empty(kept, columns) for columns in (2, 3, 3))
         depths, det, alphas, depth_keys = (means.new_empty(kept) for _ in range(4))
-        radii = torch.empty(kept, dtype=torch.int32)
+        radii = torch.empty(kept, dtype=torch.int32, device="cpu")
         task.fill(
             offsets=offsets, ids=ids, radii=radii, means2d=means2d, depths=depths, cov2d=cov2d, dets=det,
             opacities=alphas, directions=directions, depth_keys=depth_keys,
@@ -93,7 +94,7 @@ class CompiledProject(torch.autograd.Function):
         out = {name: torch.empty_like(tensor) if needed else None for name, tensor, needed in wanted}
         ranges = -(-scene[0].shape[0] // library.pointsplat_range())
         # gradients of the camera's rotation by rows, then of its centre
-        sums = torch.empty(ranges, 12, dtype=torch.float64) if any(ctx.needs_input_grad[4:6]) else None
+        sums = torch.empty(ranges, 12, **DOUBLES) if any(ctx.needs_input_grad[4:6]) else None
         names = ("grad_means2d", "grad_depths", "grad_cov2d", "grad_det", "grad_opacities", "grad_directions")
         grads = {name: grad if grad is None else grad.contiguous() for name, grad in zip(names, given, strict=False)}
         task = KERNELS.structs["ProjectionGradient"](
@@ -114,11 +115,12 @@ def _as_torch() -> bool:
     count, size = 90, 40
 
     def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
+        return torch.randn(*shape, generator=generator, **FLOATS)
 
-    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 2.0])
+    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 2.0], **FLOATS)
     scene = means, random(count, 4), (0.8 * random(count, 3) - 2.0).exp(), random(count).sigmoid()
-    view, centre = torch.linalg.qr(random(3, 3).double() * 0.2 + torch.eye(3).double())[0], 0.1 * random(3).double()
+    view = torch.linalg.qr(random(3, 3).double() * 0.2 + torch.eye(3, **DOUBLES))[0]
+    centre = 0.1 * random(3).double()
     lens = Lens(30.0, 32.0, 18.0, 21.0, size, size, 0.01, 1e10, 0.0, 0.3, True)
     projected = []
     for function in (ewa.Project, CompiledProject):

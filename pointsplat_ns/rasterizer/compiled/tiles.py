@@ -15,6 +15,7 @@ from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, on_threads
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
 def _grid(grid: Grid) -> Struct:
@@ -50,11 +51,11 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
     library, count = KERNELS.library, len(ellipses.order)
     heights = ellipses.row1.clamp_max(region.bottom - 1).sub_(ellipses.row0.clamp_min(region.top)).add_(1).clamp_min_(0)
-    starts = torch.zeros(count + 1, dtype=torch.int64)
+    starts = torch.zeros(count + 1, **INDICES)
     torch.cumsum(heights, 0, out=starts[1:])
-    strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32), torch.zeros_like(ellipses.order)
+    strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32, device="cpu"), torch.zeros_like(ellipses.order)
     tiles = grid.cameras * region.rows * region.columns
-    offsets = torch.zeros(tiles + 1, dtype=torch.int64)
+    offsets = torch.zeros(tiles + 1, **INDICES)
     task = KERNELS.structs["Listing"](
         grid=_grid(grid), ellipses=_ellipses(ellipses), **region._asdict(), tiles=tiles, starts=starts, strips=strips,
         counts=counts, offsets=offsets,
@@ -74,12 +75,12 @@ def _as_torch() -> bool:
     count, grid = 90, Grid(2, 43, 6, 8)
 
     def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, **FLOATS)
 
-    means2d, cov2d = random(count, 2) * 70 - 5, torch.tensor([0.3, 0.0, 0.3]) + random(count, 3) * 9.0
+    means2d, cov2d = random(count, 2) * 70 - 5, torch.tensor([0.3, 0.0, 0.3], **FLOATS) + random(count, 3) * 9.0
     cov2d[:, 1] = (2 * random(count) - 1) * (cov2d[:, 0] * cov2d[:, 2]).sqrt()
     det, opacities = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count)
-    order, cameras = torch.randperm(count, generator=generator), torch.arange(count) % 2
+    order, cameras = torch.randperm(count, generator=generator, device="cpu"), torch.arange(count, **INDICES) % 2
     found = []
     for functions in (in_torch.ellipses_of, in_torch.pairs_of), (ellipses_of, pairs_of):
         ellipses = functions[0](means2d, cov2d, det, opacities, order, cameras, grid, ALPHA_MIN)

@@ -22,7 +22,7 @@ from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.refiner.encoder import BatchNorm
+from pointsplat_ns.refiner.layers import BatchNorm
 from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file

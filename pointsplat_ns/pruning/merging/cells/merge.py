@@ -36,6 +36,7 @@ from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.system.processes import by_first, first_alone, rank, together, world_size
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -162,7 +163,7 @@ class _Work:
             prices.append(found["prices"])
         most = min(left - self.k, max(1, int(left * self.settings.round_share)))
         joined = torch.cat(prices)
-        chosen = torch.zeros(len(joined), dtype=torch.bool)
+        chosen = torch.zeros(len(joined), **FLAGS)
         chosen[joined.sort(stable=True).indices[:most]] = True
         parts = chosen.split([len(part) for part in prices])
         return {**{f"{cell}": part for cell, part in enumerate(parts)}, "left": left - chosen.sum()}
@@ -182,14 +183,14 @@ class _Work:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
         if number == 0:
             state = self._first_state(cell)
-            return state, torch.arange(len(state))
+            return state, torch.arange(len(state), **INDICES)
         scratch = self.cells.scratch
         before = scratch.known(_round(number - 1, cell))
         of_each = {name: before[name] for name in _OF_EACH}
         state = State(**of_each, centre=self.overview.centre, size=float(self.overview.size))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))
-        stays = torch.ones(len(state), dtype=torch.bool)
+        stays = torch.ones(len(state), **FLAGS)
         stays[second] = False
         place = stays.cumsum(0) - 1
         place[second] = place[first]
@@ -220,7 +221,7 @@ class _Work:
                 few = max(1, len(part) * self.k // self.cells.count)
                 merged = merge(part, few, views=self.sampler(part), settings=self.settings)
                 changes.append(merged.finish.size_change)
-        return {"changes": torch.tensor(changes)}
+        return {"changes": torch.tensor(changes, **FLOATS)}
 
     def _write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
         """Regroup the members of a cell, and write the rows of its groups."""
@@ -228,7 +229,7 @@ class _Work:
             state, group = self._state(rounds, cell)
             participants = self._participants(cell)
             first = first_members(participants, group, len(state))
-            groups = Groups.of(state, group, torch.ones(len(group)), first)
+            groups = Groups.of(state, group, torch.ones(len(group), **FLOATS), first)
             del state
             if groups.any_merged:
                 groups = regrouped(participants, group, areas_of(groups.cov), groups.alphas, self.settings)

@@ -15,6 +15,7 @@ from pointsplat_ns.pruning.merging.participants import Participants, drawable
 from pointsplat_ns.pruning.merging.rounds import views_and_weights
 from pointsplat_ns.pruning.merging.settings import MergeSettings
 from pointsplat_ns.pruning.merging.state import ColourAxes, principal_axes
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
 
@@ -51,5 +52,5 @@ def overview_of(
     participants = Participants(scene, members, *content_size(scene))
     _, weights = views_and_weights(participants, views, settings)
     axes = principal_axes(scene, members, settings)
-    size = torch.tensor(participants.size, dtype=torch.float64)
+    size = torch.tensor(participants.size, **DOUBLES)
     return Overview(participants.centre, size, cells.keys[members], weights, *axes)

@@ -16,6 +16,7 @@ from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_
 from pointsplat_ns.io.files import logger, usable_part
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.pruning.merging.cells.scratch import Scratch
+from pointsplat_ns.system.tensors import INDICES
 
 
 @dataclass(frozen=True)
@@ -99,21 +100,21 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         raise SceneError(
             f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or infinite values"
         )
-    numbers = torch.tensor(picked)[usable]
+    numbers = torch.tensor(picked, **INDICES)[usable]
     some = usable_part(some)
     cube = bulk_cube(some.means)
     keys = curve_keys(unit_cells(some.means, cube))
     places = _places(keys, numbers, rows.count).sort().values
     cells = -(-rows.count // most)
-    borders = places[torch.arange(1, cells) * len(places) // cells]
+    borders = places[torch.arange(1, cells, **INDICES) * len(places) // cells]
 
     def write() -> dict[str, Tensor]:
-        counts = torch.zeros(cells, dtype=torch.int64)
+        counts = torch.zeros(cells, **INDICES)
         with ExitStack() as stack:
             files = [stack.enter_context((scratch.folder / _name(cell)).open("wb")) for cell in range(cells)]
             for start in range(0, rows.count, CELLS.rows_at_once):
                 piece = rows.read(start, min(start + CELLS.rows_at_once, rows.count))
-                numbers = torch.arange(start, start + len(piece))[piece.usable()]
+                numbers = torch.arange(start, start + len(piece), **INDICES)[piece.usable()]
                 piece = usable_part(piece)
                 own = curve_keys(unit_cells(piece.means, cube))
                 cell = torch.searchsorted(borders, _places(own, numbers, rows.count), right=True)

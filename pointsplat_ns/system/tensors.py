@@ -1,0 +1,43 @@
+"""torch's global settings change nothing here: each tensor is made with its type and its place named, and functions
+that need gradients leave the caller's inference mode."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import torch
+
+FLOATS: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+DOUBLES: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
+INDICES: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
+FLAGS: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def of_network() -> dict[str, Any]:
+    """Type and place of a network's parameters: float32, on the device that the network's constructor has entered."""
+    return {"dtype": torch.float32, "device": torch.get_default_device()}
+
+
+def normal_mode(function: Function) -> Function:
+    """The function, run outside of inference mode even if it is called in it. Scenes and views among its arguments that
+    were made in inference mode are copied, because torch takes no gradients of such tensors."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        with torch.inference_mode(False):
+            return function(*map(_copied, args), **{name: _copied(value) for name, value in kwargs.items()})
+
+    return cast(Function, run)
+
+
+def _copied(value: Any) -> Any:
+    """A dataclass whose tensors of inference mode are copied; anything else as it is."""
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else ()
+    tensors = {field.name: getattr(value, field.name) for field in fields}
+    changes = {name: t.clone() for name, t in tensors.items() if isinstance(t, torch.Tensor) and t.is_inference()}
+    return dataclasses.replace(value, **changes) if changes else value

@@ -1,0 +1,204 @@
+"""torch's global settings, which other code of the process may have changed, change no result."""
+
+import ast
+import dataclasses
+import importlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager, contextmanager
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+from torch.utils._device import _device_constructors
+
+import pointsplat_ns as ps
+from making import box_room, move_zero_layers
+from pointsplat_ns.compression import repair
+from pointsplat_ns.compression.level_stream import Chunks
+from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.refiner import Refiner, preset, save_refiner
+from pointsplat_ns.system.kernels import Kernels
+from pointsplat_ns.system.tensors import FLAGS, FLOATS
+
+PACKAGE = Path(ps.__file__).parent
+
+MAKERS = {function.__name__ for function in _device_constructors()}
+"""Functions of torch whose tensor is on the default device unless a device is named."""
+
+OF_FIXED_TYPE = {"randperm", "randint", "tril_indices", "triu_indices"}
+"""Makers of int64, whatever the default type."""
+
+LAYERS = {name for name, kind in vars(nn).items() if isinstance(kind, type) and "dtype" in signature(kind).parameters}
+"""Layers whose parameters have the default type and are on the default device unless both are named."""
+
+NAMED_BY = {"FLOATS", "DOUBLES", "INDICES", "FLAGS", "of_network()"}
+"""Arguments ``**x`` that name a type and a device; see :mod:`pointsplat_ns.system.tensors`."""
+
+
+def unnamed(text: str) -> list[tuple[int, str]]:
+    """Line and call of every tensor or layer that a program makes without a type or a device."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Call):
+            continue
+        module, _, name = ast.unparse(node.func).rpartition(".")
+        wanted = {"dtype", "device"}
+        if module == "torch" and name in MAKERS:
+            wanted -= {"dtype"} if name in OF_FIXED_TYPE else set()
+        elif module not in ("nn", "torch.nn") or name not in LAYERS:
+            continue
+        by = {word.arg for word in node.keywords}
+        if any(word.arg is None and ast.unparse(word.value) in NAMED_BY for word in node.keywords):
+            by |= wanted
+        if not wanted <= by:
+            found.append((node.lineno, ast.unparse(node)))
+    return found
+
+
+def test_every_tensor_of_the_package_is_made_with_type_and_device():
+    assert len(MAKERS) > 20 and {"Linear", "Conv2d", "LayerNorm", "Embedding"} <= LAYERS
+    assert len(unnamed("torch.zeros(3)\ntorch.eye(3, device=x.device)\nnn.Linear(3, 4)\ntorch.ones(2, **FLOATS)")) == 3
+    files = {str(path.relative_to(PACKAGE)): unnamed(path.read_text("utf-8")) for path in PACKAGE.rglob("*.py")}
+    assert {path: calls for path, calls in files.items() if calls} == {}
+
+
+@contextmanager
+def default_type(dtype: torch.dtype):
+    """Within, numbers without a type have this one."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextmanager
+def default_device(device: str):
+    """Within, tensors without a device are made on this one; on "meta" they have no numbers, so any use fails."""
+    torch.set_default_device(device)
+    try:
+        yield
+    finally:
+        torch.set_default_device(None)
+
+
+@contextmanager
+def deterministic_without_gradients():
+    """Within, torch refuses operations that may give other bits, fills memory before it is written, and keeps no
+    graph."""
+    torch.use_deterministic_algorithms(True)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+SETTINGS: dict[str, Callable[[], AbstractContextManager]] = {
+    "float64 is the default type": lambda: default_type(torch.float64),
+    "meta is the default device": lambda: default_device("meta"),
+    "inference mode": torch.inference_mode,
+    "no gradients, deterministic algorithms": deterministic_without_gradients,
+}
+
+
+def plain(value: Any) -> Any:
+    """Lists, numbers and bytes in place of scenes, views and tensors."""
+    if isinstance(value, torch.Tensor):
+        return str(value.dtype), str(value.device), value.tolist()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, (tuple, list)) else value
+
+
+def results_of(scene: Path, folder: Path) -> dict[str, Any]:
+    """What the public functions give for a scene's file."""
+    room = ps.load(scene)
+    views = ps.sample_views(room, 3, width=48, height=36)
+    image, other = ps.render(room, views[0]), ps.render(room[:100], views[0])
+    found: dict[str, Any] = {
+        "views": views,
+        "image": image,
+        "psnr": ps.psnr(image, other),
+        "ssim": ps.ssim(image, other),
+    }
+    for by, method in METHODS.items():
+        found[f"pruned by {by}"] = ps.prune(room, 0.3, by=by, views=views if method.needs_views else None)
+    found["pruned and tuned"] = ps.prune(room, 0.3, sh="auto", clean=True, fine_tune=2, views=views)
+    compacted = ps.compact(room, 0.3, views=views)
+    repaired = compacted.repaired
+    assert repaired is not None
+    found["compacted"] = [compacted.scene, compacted.psnr, repaired.scene]
+    found["compacted, sampled views"] = ps.compact(room, 0.3).scene
+    refiner = ps.load_refiner(folder.parent / "refiner.safetensors")
+    found["refined"] = ps.refine(found["pruned by paper"], refiner)
+    levels = ps.lod(room, ["50%", 60], views=views, folder=folder / "levels")
+    found["levels"] = [[level.scene, level.errors] for level in levels]
+    ps.lod(room, ["50%", 60], views=views, folder=folder / "stream", stream=Chunks())
+    for suffix in (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb"):
+        ps.save(room, folder / f"room{suffix}")
+        found[suffix] = ps.load(folder / f"room{suffix}")
+    found["info"] = ps.info(scene)
+    ps.plot_views(room, folder / "views.png", views=views)
+    ps.plot_distributions({"before": room, "after": compacted.scene}, folder / "distributions.png")
+    ps.write_page(room, folder / "room.html", views=views)
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {name: plain(value) for name, value in found.items()} | files
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    """The scene's file, and the results where no setting is changed."""
+    folder = tmp_path_factory.mktemp("settings")
+    ps.save(box_room(0, count=300), folder / "scene.ply")
+    torch.manual_seed(0)
+    save_refiner(move_zero_layers(Refiner(preset("tiny", sh_degree=1))), folder / "refiner.safetensors", {"keep": 0.2})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(repair.STEPS, "quick", 4)
+        (folder / "usual").mkdir()
+        yield folder, results_of(folder / "scene.ply", folder / "usual")
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_the_api_gives_the_same_bits_whatever_torchs_settings(setting, usual):
+    folder, wanted = usual
+    own = folder / setting.replace(" ", "-")
+    own.mkdir()
+    with SETTINGS[setting]():
+        found = results_of(folder / "scene.ply", own)
+    assert [name for name in {*wanted, *found} if found.get(name) != wanted.get(name)] == []
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_kernels_are_tried_the_same_whatever_torchs_settings(setting):
+    modules = [path for path in PACKAGE.rglob("*.py") if "KERNELS = Kernels(" in path.read_text("utf-8")]
+    names = ["pointsplat_ns." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in modules]
+    kernels = [importlib.import_module(name).KERNELS for name in names]
+    if any(each.why_missing for each in kernels):
+        pytest.skip(f"no kernels: {kernels[0].why_missing}")
+    with SETTINGS[setting]():
+        missing = {each.source.name: Kernels(each.what, each.source, each.agree).why_missing for each in kernels}
+    assert len(missing) >= 10 and not any(missing.values())
+
+
+def test_a_network_is_float32_on_the_device_that_was_asked_for():
+    with default_type(torch.float64), default_device("meta"):
+        made = Refiner(preset("tiny"))
+        assert {(value.dtype, value.device.type) for value in made.parameters()} == {(torch.float32, "cpu")}
+        assert {value.device.type for value in Refiner(preset("tiny"), device="meta").parameters()} == {"meta"}
+
+
+def test_scenes_made_in_inference_mode_are_repaired_outside_of_it(usual, monkeypatch):
+    folder, _ = usual
+    with torch.inference_mode():
+        room = ps.load(folder / "scene.ply")
+        views = ps.sample_views(room, 3, width=48, height=36)
+    assert torch.ones(1, **FLAGS).is_inference() is False and torch.zeros(1, **FLOATS).requires_grad is False
+    compacted = ps.compact(room, 0.3, views=views)
+    assert compacted.repaired is not None and not compacted.scene.means.is_inference()
