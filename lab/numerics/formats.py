@@ -25,7 +25,7 @@ from lab.common.scenes import name_of
 from lab.common.timing import seconds_of
 from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.spz import SH_BITS, write_spz
+from pointsplat_ns.io.formats.spz import SH_BITS, encode_spz
 from pointsplat_ns.looking.closeness import DenseReference
 
 VIEWS, SEED = 12, 1
@@ -57,7 +57,7 @@ def measure(scene: ps.Gaussians, name: str, peer: Path | None) -> Iterator[Row]:
                 label = format_to_write(path).name + " 3" * (file == "a.spz")
                 yield row(label, path, seconds_of(lambda path=path: ps.save(scene, path)))
             else:
-                write = lambda path=path, bits=bits: write_spz(scene, path, version=4, sh_bits=bits)  # noqa: E731
+                write = lambda path=path, bits=bits: path.write_bytes(encode_spz(scene, version=4, sh_bits=bits))  # noqa: E731
                 yield row(f"SPZ 4, SH of {bits[0]} and {bits[1]} bits", path, seconds_of(write))
         for file in OF_SPLAT_TRANSFORM if peer is not None else ():
             path = Path(folder) / f"peer_{file}"

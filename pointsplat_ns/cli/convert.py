@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import time
 from pathlib import Path
 from typing import Literal
@@ -52,8 +54,9 @@ def convert(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.formats.spz import write_spz
-    from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.io.formats.registry import writer
+    from pointsplat_ns.io.formats.spz import encode_spz
+    from pointsplat_ns.io.scene import is_folder_of_scenes, save_as
     from pointsplat_ns.pruning import cut_sh
     from pointsplat_ns.system.progress import progress_bar
 
@@ -75,11 +78,12 @@ def convert(
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None)
-    if format_to_write(output).suffix == ".spz":
-        with progress_bar() as report:
-            write_spz(after, output, report, spz_version, spz_sh_bits)
-    else:
-        ps.save(after, output, progress=True)
+    kind = format_to_write(output)
+    if kind.suffix == ".spz":
+        encode = functools.partial(encode_spz, version=spz_version, sh_bits=spz_sh_bits)
+        kind = dataclasses.replace(kind, write=writer(encode))
+    with progress_bar() as report:
+        save_as(kind, after, output, report)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(len(before), after, seconds, output))

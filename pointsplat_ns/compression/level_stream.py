@@ -17,9 +17,10 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.formats import STREAM_META
+from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
+from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.pages.stream_page import StreamPage, page_files
 from pointsplat_ns.system.progress import Progress, silent
@@ -85,6 +86,8 @@ def write_stream(
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
     if page is not None and page.turn is not None:
         scenes = [page.turn.apply(scene) for scene in scenes]
+    if scenes:
+        warn_of_losses(format_to_write(SOG_META), scenes[0], folder)
     sizes = chunks or Chunks()
     tree = partition(scenes, [of.cpu().long() for of in parents], sizes)
     with ExitStack() as stack:

@@ -206,7 +206,7 @@ def _write(task: SceneTask, made: SmallerScene, key: str, options: CommandOption
         if made.same and task.source.is_file() and format_to_read(task.source) is kind:
             shutil.copyfile(task.source, part)
         else:
-            save_as(kind, made.scene, part)
+            save_as(kind, made.scene, part, name=task.output)
         done = task.result(
             "done",
             before=made.before,

@@ -11,6 +11,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
+from pointsplat_ns.io.formats.holding import losses
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
@@ -140,9 +141,21 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
         save_as(format_to_write(path), scene, path, report)
 
 
-def save_as(kind: Format, scene: Gaussians, path: Path, progress: Progress = silent) -> None:
-    """Write a scene in a format that is written, whatever the path's name; otherwise as :func:`save`."""
+def save_as(
+    kind: Format, scene: Gaussians, path: Path, progress: Progress = silent, name: Path | str | None = None
+) -> None:
+    """Write a scene in a format that is written, whatever the path's name, and warn of what the format does not hold;
+    otherwise as :func:`save`. ``name`` is the path in the warning."""
     assert kind.write is not None
-    if scene.antialiased and not kind.holds_antialiased:
-        logger.warning("%s: a %s does not say that the scene was trained with antialiasing", path, kind.suffix)
-    kind.write(keep_usable(scene.detach().to("cpu", torch.float32), path), path, progress)
+    scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
+    warn_of_losses(kind, scene, name or path)
+    kind.write(scene, path, progress)
+
+
+def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
+    """Log what a format does not hold of a scene, float32 on the CPU, and which format does."""
+    found = losses(scene, kind.capacity)
+    if found:
+        others = (format_named(suffix) for suffix in (".sog", ".glb", ".ply"))
+        keeper = next(other.suffix for other in others if other is not None and not losses(scene, other.capacity))
+        logger.warning("%s: lost in %s: %s; %s keeps it", name, kind.name, "; ".join(found), keeper)

@@ -10,7 +10,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud, same_bits
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.formats.spz import read_spz, write_spz
+from pointsplat_ns.io.formats.spz import encode_spz, read_spz
 
 AXES = 0xADBE0003
 TO_RUB = {  # number in the file, and what a point (x, y, z) of these axes is in right, up, back
@@ -35,7 +35,7 @@ def with_records(path, *records, flags=2, table=None):
 @pytest.fixture()
 def scene(tmp_path):
     """A scene that an SPZ file holds, with what is read of it."""
-    write_spz(cloud(60, 3, 3), tmp_path / "a.spz", version=4)
+    (tmp_path / "a.spz").write_bytes(encode_spz(cloud(60, 3, 3), version=4))
     return read_spz(tmp_path / "a.spz")
 
 

@@ -6,9 +6,12 @@ Gaussian is four 32-bit words of bits between these bounds, and a quaternion wit
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits, sh_degree_of
@@ -28,6 +31,7 @@ from pointsplat_ns.io.formats.coding import (
     smallest_three,
     unit_quats,
 )
+from pointsplat_ns.io.formats.holding import FLOAT, Holds, Span, within_colours
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -43,6 +47,9 @@ _BOUNDS = tuple(
 )
 _BITS_3 = ((21, 11), (11, 10), (0, 11))  # shift and number of bits of each of three numbers in a word
 _BITS_4 = ((24, 8), (16, 8), (8, 8))  # of four numbers; the last is opacity
+_ROTATION_BITS = ((20, 10), (10, 10), (0, 10))
+SIZES, SH = Span(-20.0, 20.0), Span(-4.0, 4.0, 8 / 256)
+"""Log-scales, whose bounds must be finite, and SH coefficients above degree 0."""
 
 
 def is_compressed(header: Header) -> bool:
@@ -81,14 +88,14 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
     """The bytes of a compressed PLY of a scene, float32 on the CPU. Gaussians are reordered, so that those of a chunk
     are near each other. ``progress`` is not called."""
     n = len(scene)
-    scene = scene[morton_order(scene)]
-    scales = scene.scales.double().clamp(-20.0, 20.0).numpy()  # the bounds must be finite
+    scene = fitted(scene)[0][morton_order(scene)]
+    scales = scene.scales.double().clamp(SIZES.low, SIZES.high).numpy()
     parts = (scene.means.double().numpy(), scales, shares_of_dc(scene))
     bounds = [_bounds(part) for part in parts]
     chunks = np.concatenate([side for low_high in bounds for side in low_high], axis=1).astype("<f4")
     shares = [_shares(part, chunks[:, 6 * i : 6 * i + 6]) for i, part in enumerate(parts)]
     largest, others = smallest_three(unit_quats(scene))
-    rotation = _pack(others / 2**0.5 + 0.5, ((20, 10), (10, 10), (0, 10))) | largest.astype(np.uint32) << 30
+    rotation = _pack(others / 2**0.5 + 0.5, _ROTATION_BITS) | largest.astype(np.uint32) << 30
     opacity = bytes_of_logits(scene).astype(np.uint32)
     words = (
         _pack(shares[0], _BITS_3),
@@ -101,6 +108,35 @@ def encode_compressed_ply(scene: Gaussians, progress: Progress = silent) -> byte
     packed = np.stack(words, axis=1).astype("<u4")
     header = _header_text(n, rest.shape[1], scene.traits)
     return b"".join((header, chunks.tobytes(), packed.tobytes(), sh.tobytes()))
+
+
+def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
+    """A scene with colours and SH in the range of the format, as by
+    :func:`~pointsplat_ns.io.formats.holding.within_colours`; nothing is moved."""
+    return within_colours(scene, FLOAT, SH), ""
+
+
+def _steps(values: Array, scene: Gaussians, bits: tuple[tuple[int, int], ...]) -> Tensor:
+    """The largest step (N,) of values (N, 3) in the chunk of each Gaussian."""
+    order = morton_order(scene)
+    low, high = _bounds(values[order.numpy()])
+    spans = (high - low) / np.array([(1 << n) - 1 for _, n in bits])
+    of_rows = torch.from_numpy(spans.max(axis=1).repeat(CHUNK_GAUSSIANS)[: len(values)])
+    return torch.empty_like(of_rows).index_copy_(0, order, of_rows)
+
+
+_CHUNK = f"{_BITS_3[0][1]} or {_BITS_3[1][1]} bits within {CHUNK_GAUSSIANS} neighbours"
+HOLDS = Holds(
+    positions=Span(how=_CHUNK),
+    sizes=replace(SIZES, how=_CHUNK),
+    colours=Span(how=f"{_BITS_4[0][1]} bits within {CHUNK_GAUSSIANS} neighbours"),
+    opacities=Span(0.0, 1.0, 1 / 255),
+    rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 1023),
+    sh=SH,
+    position_steps=lambda scene: _steps(scene.means.double().numpy(), scene, _BITS_3),
+    colour_steps=lambda scene: _steps(scene.features_dc.double().numpy(), scene, _BITS_4),
+    fitted=fitted,
+)
 
 
 def _header_text(count: int, rest: int, traits: Traits) -> bytes:
@@ -165,7 +201,7 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
         return low + (high - low) * shares
 
     tops = (rotation >> 30).astype(np.int64)
-    others = (_unpack(rotation, ((20, 10), (10, 10), (0, 10))) - 0.5) * 2**0.5
+    others = (_unpack(rotation, _ROTATION_BITS) - 0.5) * 2**0.5
     coefficients = np.empty((len(vertex), rest, 3), np.float32)
     for i in range(3 * rest if sh is not None else 0):
         assert sh is not None

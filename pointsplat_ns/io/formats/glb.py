@@ -32,6 +32,7 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
 from pointsplat_ns.io.formats.spz import decode_spz
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.system.progress import Progress, silent
@@ -39,6 +40,8 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
+
+HOLDS = Holds(sizes=FLOAT_SIZES, opacities=Span(0.0, 1.0), antialiased=False)
 
 _EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz"

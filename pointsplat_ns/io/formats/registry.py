@@ -18,6 +18,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.formats import compressed_ply, glb, ksplat, sog, splat, spz_range
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
     compressed_ply_bytes,
@@ -26,6 +27,7 @@ from pointsplat_ns.io.formats.compressed_ply import (
     read_compressed_ply,
 )
 from pointsplat_ns.io.formats.glb import encode_glb, glb_bytes, read_glb
+from pointsplat_ns.io.formats.holding import Holds
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
@@ -64,8 +66,8 @@ class Format:
     """The bytes of a file of a scene, where only they tell its size."""
     rounded: Callable[[Gaussians, Rounding], Gaussians] | None = None
     """A scene whose numbers are rounded, so that a file of it is smaller."""
-    holds_antialiased: bool = True
-    """Whether a file says that a scene was trained with antialiasing."""
+    capacity: Holds = Holds()
+    """The range and the step of each attribute in its files."""
     order: Callable[[Gaussians], Tensor] | None = None
     """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
 
@@ -80,7 +82,7 @@ class Format:
         return name.endswith(self.suffix) if self.suffix.startswith(".") else name == self.suffix != ""
 
 
-def _writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
+def writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
     """A function that writes encoded bytes to a file, whole or not at all."""
 
     def write(scene: Gaussians, path: Path, progress: Progress) -> None:
@@ -99,13 +101,13 @@ _EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 FORMATS = (
     # Longer ends of names come before those that they end with; what several formats hold after what one holds.
     Format(
-        "compressed PLY", ".compressed.ply", read_compressed_ply, _writer(encode_compressed_ply), _PLY,
-        bytes_of=compressed_ply_bytes, order=morton_order,
+        "compressed PLY", ".compressed.ply", read_compressed_ply, writer(encode_compressed_ply), _PLY,
+        bytes_of=compressed_ply_bytes, capacity=compressed_ply.HOLDS, order=morton_order,
     ),
     Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes),
     Format(
-        "SPZ", ".spz", read_spz, _writer(encode_spz), (b"\x1f\x8b\x08", b"NGSP"), encode=encode_spz,
-        rounded=rounded_for_spz,
+        "SPZ", ".spz", read_spz, writer(encode_spz), (b"\x1f\x8b\x08", b"NGSP"), encode=encode_spz,
+        rounded=rounded_for_spz, capacity=spz_range.HOLDS,
     ),
     Format(
         "SuperSplat project", ".ssproj", holds="document.json",
@@ -113,20 +115,21 @@ FORMATS = (
     ),
     Format("zip of a streamed SOG", "", holds="lod-meta.json", instead="unpack it and name its folder"),
     Format(
-        "SOG", ".sog", read_sog, _writer(encode_sog), holds="meta.json", encode=encode_sog, rounded=rounded_for_sog,
-        order=morton_order,
+        "SOG", ".sog", read_sog, writer(encode_sog), holds="meta.json", encode=encode_sog, rounded=rounded_for_sog,
+        capacity=sog.HOLDS, order=morton_order,
     ),
     Format("checkpoint", ".ckpt", read_checkpoint, starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",), holds="data.pkl"),
-    Format("streamed SOG", STREAM_META, read_sog_stream),
+    Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.HOLDS),
     Format(
-        "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog, order=morton_order
+        "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog,
+        capacity=sog.HOLDS, order=morton_order,
     ),
-    Format("ksplat", ".ksplat", read_ksplat),
+    Format("ksplat", ".ksplat", read_ksplat, capacity=ksplat.HOLDS),
     Format(
-        "splat", ".splat", read_splat, _writer(encode_splat), bytes_of=splat_bytes,
-        holds_antialiased=False, order=drawing_order,
+        "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
+        capacity=splat.HOLDS, order=drawing_order,
     ),
-    Format("glTF", ".glb", read_glb, _writer(encode_glb), (b"glTF",), bytes_of=glb_bytes, holds_antialiased=False),
+    Format("glTF", ".glb", read_glb, writer(encode_glb), (b"glTF",), bytes_of=glb_bytes, capacity=glb.HOLDS),
     Format("zipped PLY", "", read_zipped, holds="*.ply"),
     Format("LCC", ".lcc", instead=_LCC), Format("LCC", ".lcc2", instead=_LCC),
     Format("Postshot project", ".psht", instead=_EXPORT),

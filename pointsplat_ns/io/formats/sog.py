@@ -37,6 +37,7 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
@@ -46,6 +47,10 @@ from pointsplat_ns.system.tensors import FLOATS
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
 
+LEAST_SIZE = -30.0
+"""Log-scales below are written as this."""
+
+_LEVELS = 65_535  # of positions, steps
 _ACROSS = 64  # palette entries in one row of pixels
 _MOST_ENTRIES = 65_536  # of a palette
 _LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
@@ -130,7 +135,7 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     pixels = functools.partial(_pixels, images, n)
     low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
-    logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / 65535
+    logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / _LEVELS
     quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])
     tops = quats[:, 3].astype(np.int64) - _LARGEST
     rotations = from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
@@ -223,7 +228,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
     levels, mins, maxs = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(-30.0))  # as of flat axes
+    scales, scale_index = codebook(scene.scales.clamp_min(LEAST_SIZE))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = smallest_three(unit_quats(scene))
     meta: dict[str, Any] = {
@@ -265,7 +270,25 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
     means = scene.means.double().numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
-    return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * 65535, mins, maxs
+    return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _LEVELS, mins, maxs
+
+
+def _position_steps(scene: Gaussians) -> Tensor:
+    """Along the axis with the coarsest levels, (N,)."""
+    _, mins, maxs = _levels_of(scene)
+    each = torch.from_numpy((maxs - mins) / _LEVELS)
+    return (each * (1 + scene.means.double().abs())).amax(dim=1)
+
+
+HOLDS = Holds(
+    positions=Span(how=f"{_LEVELS.bit_length()} bits of log(1 + abs(x)), with its sign"),
+    sizes=Span(LEAST_SIZE, how=f"{LEVELS} own numbers"),
+    colours=Span(how=f"{LEVELS} own numbers"),
+    opacities=Span(0.0, 1.0, 1 / 255),
+    rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 255),
+    sh=Span(how=f"{LEVELS} own numbers, {_MOST_ENTRIES:,} rows"),
+    position_steps=_position_steps,
+)
 
 
 def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
@@ -276,10 +299,10 @@ def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
         return scene
     steps = steps_of(scene, rounding.tolerance)
     levels, mins, maxs = _levels_of(scene)
-    of_level = torch.from_numpy((maxs - mins) / 65535) * (1 + scene.means.double().abs())  # world units
+    of_level = torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())  # world units
     coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
-    outermost = (levels <= 0) | (levels >= 65535)  # they stay, so that levels keep their meaning
-    logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, 65535)) / 65535
+    outermost = (levels <= 0) | (levels >= _LEVELS)  # they stay, so that levels keep their meaning
+    logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, _LEVELS)) / _LEVELS
     means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
     rest = _few_sh(scene, rounding.tolerance) if scene.sh_degree else scene.features_rest
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)

@@ -72,7 +72,7 @@ class Images:
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
             raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
-        most = 4 * least + (1 << 16)  # some programs round sides up
+        most = 6 * least + (1 << 16)  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
         data = self._bytes(name, 4 * most)
         across, down = webp_size(data)  # opening an image takes the memory of its pixels already
         if across * down < least or across * down > most or width not in (None, across):

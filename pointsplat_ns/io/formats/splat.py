@@ -13,7 +13,8 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
-from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
+from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.io.files import keep_usable, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     bytes_of_logits,
     damage_named,
@@ -26,9 +27,19 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
+from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+HOLDS = Holds(
+    sizes=FLOAT_SIZES,
+    colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)),
+    opacities=Span(0.0, 1.0, 1 / 255),
+    rotations=Span(-1.0, 127 / 128, 1 / 128),
+    sh=None,
+    antialiased=False,
+)
 
 
 def read_splat(path: Path | str) -> Gaussians:
@@ -72,13 +83,8 @@ def drawing_order(scene: Gaussians) -> Tensor:
 def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
     """The bytes of a ``.splat`` file of a scene, float32 on the CPU, in :func:`drawing_order`.
 
-    SH beyond the constant coefficient have no place in it; that they are left out is logged. ``progress`` is not
-    called.
+    SH beyond the constant coefficient have no place in it and are left out. ``progress`` is not called.
     """
-    if scene.sh_degree:
-        logger.warning(
-            ".splat holds no SH: degree %d is left out, colours no longer change with the view", scene.sh_degree
-        )
     scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)
     rows["means"] = scene.means.numpy()

@@ -8,7 +8,6 @@ other axes, the scene is turned to RUB.
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, logger, replacing, require_file
+from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats.coding import (
     Array,
     Blocks,
@@ -37,14 +36,12 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
+from pointsplat_ns.io.formats.spz_range import COLOUR_SCALE, MAX_FRACTION_BITS, SIZES, fitted, fraction_bits
 from pointsplat_ns.io.turning import turned
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 
 Version = Literal[3, 4]
-
-FRACTION_BITS = 12
-"""Bits of a position after the point, in scenes within 2048 units: steps of 0.00024. Larger scenes get fewer."""
 
 SH_BITS = (6, 5)
 """Bits that are kept of SH coefficients, of degree 1 and of the others, unless they have at most 8 bits already. Fewer
@@ -58,7 +55,6 @@ _AXES_EXTENSION = 0xADBE0003
 """SPZ_ADOBE_coordinate_system: the axes of the numbers in the file."""
 _AXES = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # numbered from 1
 _DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
-_COLOR_SCALE = 0.15
 _XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
 
 
@@ -136,7 +132,8 @@ def encode_spz(
     sh_bits: tuple[int, int] | None = None,
     level: int = 9,
 ) -> bytes:
-    """The bytes of an SPZ file.
+    """The bytes of an SPZ file. The scene is brought into its range as by
+    :func:`~pointsplat_ns.io.formats.spz_range.fitted`.
 
     Args:
         scene: N Gaussians, float32 on the CPU.
@@ -155,7 +152,8 @@ def encode_spz(
     if not all(1 <= bits <= 8 for bits in sh_bits):
         raise SceneError(f"SH of {sh_bits[0]} and {sh_bits[1]} bits; expected 1 to 8 bits in SPZ")
     n, flags = len(scene), _ANTIALIASED if scene.antialiased else 0
-    bits = _fraction_bits(scene)
+    scene, _ = fitted(scene)
+    bits = fraction_bits(scene)
     parts = _encode(scene, bits, sh_bits)
     if version == 3:
         head = _HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0)
@@ -181,24 +179,10 @@ def encode_spz(
 def rounded_for_spz(scene: Gaussians, rounding: Rounding) -> Gaussians:
     """A scene that takes fewer bytes as SPZ: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), those
     of SH to at most 8 bits. Arguments as of :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
-    small = rounded(scene, rounding)
+    small = rounded(fitted(scene)[0], rounding) if rounding.tolerance else scene
     if small is scene:
         return scene
     return small.replace(features_rest=(128 * small.features_rest).round().clamp(-128, 127) / 128)
-
-
-def write_spz(
-    scene: Gaussians,
-    path: Path | str,
-    progress: Progress = silent,
-    version: Version = 3,
-    sh_bits: tuple[int, int] | None = None,
-) -> None:
-    """Write an SPZ file, as :func:`encode_spz` makes it. Gaussians that cannot be drawn are left out. Raises SceneError
-    if it cannot be written, or the scene is too large for the format."""
-    data = encode_spz(keep_usable(scene.detach().to("cpu", torch.float32), path), progress, version, sh_bits)
-    with replacing(path, len(data)) as part:
-        part.write_bytes(data)
 
 
 def _head(data: bytes, path: Path) -> _Head:
@@ -210,8 +194,10 @@ def _head(data: bytes, path: Path) -> _Head:
         raise SceneError(f"{path}: SPZ of {magic!r} and version {head.version}; expected {_MAGIC!r}, version 2, 3 or 4")
     if head.degree > 4:
         raise SceneError(f"{path}: SH degree {head.degree}; expected 0 to 4")
-    if head.fraction_bits > 23:
-        raise SceneError(f"{path}: {head.fraction_bits} bits after the point; expected at most 23 of 24")
+    if head.fraction_bits > MAX_FRACTION_BITS:
+        raise SceneError(
+            f"{path}: {head.fraction_bits} bits after the point; expected at most {MAX_FRACTION_BITS} of 24"
+        )
     return head
 
 
@@ -273,10 +259,10 @@ def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
     kept = min(rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
     return scene_of(
         _from_fixed_point(positions.reshape(n, 3, 3), head.fraction_bits),
-        scales.reshape(n, 3).astype(np.float32) / 16 - 10,
+        scales.reshape(n, 3).astype(np.float32) * np.float32(SIZES.step) + np.float32(SIZES.low),
         _quats_of_three(quats) if head.version == 2 else _quats_of_four(quats),
         logits_of_bytes(alphas),
-        (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / _COLOR_SCALE,
+        (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / COLOUR_SCALE,
         (sh.reshape(n, rest, 3)[:, :kept].astype(np.float32) - 128) / 128,
     )
 
@@ -292,8 +278,8 @@ def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes
     return [
         np.ascontiguousarray(fixed[..., None]).view(np.uint8)[..., :3].tobytes(),
         bytes_of_logits(scene).tobytes(),
-        to_bytes((scene.features_dc.double().numpy() * _COLOR_SCALE + 0.5) * 255).tobytes(),
-        to_bytes((scene.scales.double() + 10) * 16).tobytes(),
+        to_bytes((scene.features_dc.double().numpy() * COLOUR_SCALE + 0.5) * 255).tobytes(),
+        to_bytes((scene.scales.double() - SIZES.low) / SIZES.step).tobytes(),
         words.astype("<u4").tobytes(),
         np.concatenate([first, other], axis=1).tobytes(),
     ]
@@ -304,19 +290,6 @@ def _coarse(coefficients: Array, bits: int) -> Array:
     step = 1 << (8 - bits)
     levels = np.rint(coefficients.astype(np.float64) * 128 / step) * step + 128
     return np.clip(levels, 0, 255).astype(np.uint8)
-
-
-def _fraction_bits(scene: Gaussians) -> int:
-    """Bits after the point with which all positions fit into 24 bits."""
-    farthest = float(scene.means.abs().max()) if len(scene) else 0.0
-    fitting = math.floor(math.log2((2**23 - 1) / farthest)) if farthest > 0 else FRACTION_BITS
-    if fitting < 0:
-        raise SceneError(
-            f"a Gaussian lies {farthest:.3g} units from the origin; SPZ reaches to {2**23 - 1}; scale the scene down"
-        )
-    if fitting < FRACTION_BITS:
-        logger.warning("SPZ: the scene reaches to %.3g units, so positions are rounded to %g", farthest, 2.0**-fitting)
-    return min(fitting, FRACTION_BITS)
 
 
 def _from_fixed_point(parts: Array, bits: int) -> Array:

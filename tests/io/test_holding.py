@@ -1,0 +1,274 @@
+"""What formats hold: their constants are true, what does not fit is brought in or named, and what fits is not."""
+
+import dataclasses
+import functools
+import logging
+import math
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import SHARED_DATA, cloud
+from pointsplat_ns.folders import convert_folder
+from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.io.formats import FORMATS, format_named, format_to_write
+from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within_colours
+from pointsplat_ns.io.formats.spz_range import COLOURS, FARTHEST, SH, fraction_bits
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+
+SPLATS = SHARED_DATA / "splats"
+WRITTEN = [kind for kind in FORMATS if kind.write is not None and kind.suffix != "meta.json"]
+
+
+@functools.cache
+def room():
+    return ps.example_room()[::6]
+
+
+@functools.cache
+def views():
+    return ps.sample_views(room(), 2, seed=0, width=160, height=120)
+
+
+def in_units(scene, unit):
+    return ps.place(scene, scale=unit)
+
+
+def psnr_of_file(scene, path, unit=1.0):
+    """PSNR in dB of what is read back of a scene whose unit is that of the room times ``unit``."""
+    viewmats = views().viewmats.clone()
+    viewmats[:, :3, 3] *= unit
+    cameras = dataclasses.replace(views(), viewmats=viewmats, near_plane=views().near_plane * unit)
+    ps.save(scene, path)
+    with torch.no_grad():
+        return float(ps.psnr(ps.render(ps.load(path), cameras), ps.render(scene, cameras)).mean())
+
+
+def loss_text(caplog):
+    """The one warning of a loss, or nothing."""
+    found = [record.getMessage() for record in caplog.records if "lost in" in record.getMessage()]
+    assert len(found) <= 1
+    return found[0] if found else ""
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", ".glb"])
+def test_a_usual_room_is_written_without_a_warning(tmp_path, caplog, suffix):
+    assert psnr_of_file(room(), tmp_path / f"a{suffix}") > 44
+    assert not caplog.records
+
+
+def test_spz_has_more_bits_after_the_point_where_gaussians_are_small(tmp_path, caplog):
+    assert psnr_of_file(in_units(room(), 0.02), tmp_path / "a.spz", 0.02) > 42  # 34 dB with 12 bits
+    assert not loss_text(caplog)
+    assert fraction_bits(room()) == 12 and fraction_bits(in_units(room(), 1 / 256)) > 15
+    assert fraction_bits(in_units(room(), 1e-6)) == 23
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-4, 1e-5])
+def test_spz_names_sizes_that_it_cuts_and_the_format_that_keeps_them(tmp_path, caplog, unit):
+    small = in_units(room(), unit)
+    psnr_of_file(small, tmp_path / "a.spz", unit)
+    text = loss_text(caplog)
+    assert "of the Gaussians are smaller than 4.5e-05 units and become larger" in text and ".sog keeps it" in text
+    assert ("positions are rounded" in text) == (unit == 1e-5)
+    caplog.clear()
+    assert psnr_of_file(small, tmp_path / "a.sog", unit) > 50
+    assert not caplog.records
+
+
+def test_spz_names_sizes_above_its_range(tmp_path, caplog):
+    ps.save(in_units(room(), 1e6), tmp_path / "a.spz")
+    assert "larger than 3.8e+02 units and become smaller" in loss_text(caplog)
+
+
+def with_floaters(scene):
+    far = torch.tensor([[5e4, 0.0, 0.0], [0.0, -5e4, 0.0], [3e4, 3e4, 5e4]])
+    return ps.Gaussians.cat([scene, scene[:3].replace(means=far, scales=torch.full((3, 3), math.log(300.0)))])
+
+
+def test_spz_brings_a_handful_of_far_gaussians_in_and_counts_them(tmp_path, caplog):
+    scene = with_floaters(room())
+    assert psnr_of_file(scene, tmp_path / "a.spz") > 44  # 38 dB where they stay
+    assert "3 Gaussians lie farther than 2048 units and are moved to there, smaller in proportion" in loss_text(caplog)
+    back = ps.load(tmp_path / "a.spz")
+    assert torch.equal(back[:-3].means, (room().means * 4096).round() / 4096)
+    centre = room().means.median(dim=0).values
+    for moved, at in zip(back[-3:].means, scene[-3:].means, strict=True):
+        one, other = (torch.nn.functional.normalize(place - centre, dim=0) for place in (moved, at))
+        assert float((one - other).abs().max()) < 1e-4  # in the same direction
+        assert math.isclose(float(moved.abs().max()), FARTHEST / 4096, rel_tol=1e-5)
+    angle = lambda of: of.stds[-3:, 0] / (of.means[-3:] - centre).norm(dim=1)  # noqa: E731
+    assert torch.allclose(angle(back), angle(scene), rtol=1 / 30)  # half a step of log-scales
+
+
+def test_spz_leaves_far_gaussians_where_their_distance_costs_nothing(tmp_path, caplog):
+    scene = in_units(with_floaters(room()), 1 / 64)  # sizes grow again: blobs of 0.03 units, floaters at 800
+    scene = scene.replace(scales=scene.scales + math.log(64.0))
+    ps.save(scene, tmp_path / "a.spz")
+    assert not loss_text(caplog)
+    assert float((ps.load(tmp_path / "a.spz").means - scene.means).abs().max()) <= 2.0**-13
+
+
+def test_spz_names_coarse_positions_where_many_gaussians_are_far(tmp_path, caplog):
+    scene = room()
+    scene = scene.replace(means=torch.where(torch.arange(len(scene))[:, None] % 2 == 0, 1e5, scene.means))
+    ps.save(scene, tmp_path / "a.spz")
+    assert "positions are rounded to 0.016 units" in loss_text(caplog)
+
+
+def with_dark(scene, lobes):
+    """A scene of which a tenth has constant coefficients down to -20: with its usual SH, so black from everywhere, or
+    with SH that give it its colour from the first view."""
+    generator = torch.Generator().manual_seed(0)
+    rest = scene.features_rest
+    dark = torch.rand(len(scene), generator=generator) < 0.1
+    dc = torch.where(dark[:, None], -4 - 16 * torch.rand(len(scene), 3, generator=generator), scene.features_dc)
+    if lobes:
+        eye = views().viewmats[0].double().inverse()[:3, 3].to(scene.means)
+        basis = sh_basis(torch.nn.functional.normalize(scene.means - eye, dim=1), 3)[:, 1:, None]
+        rest = torch.cat([rest, torch.zeros(len(scene), 12, 3)], dim=1)
+        rest += basis / basis.square().sum(dim=1, keepdim=True) * (SH_C0 * (scene.features_dc - dc))[:, None]
+    return scene.replace(features_dc=dc, features_rest=rest)
+
+
+@pytest.mark.parametrize(("suffix", "least"), [(".spz", 44), (".compressed.ply", 42)])
+def test_colours_far_below_black_stay_black(tmp_path, caplog, suffix, least):
+    assert psnr_of_file(with_dark(room(), lobes=False), tmp_path / f"a{suffix}") > least
+    assert not loss_text(caplog)
+
+
+def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog):
+    scene = with_dark(room(), lobes=True)
+    after = psnr_of_file(scene, tmp_path / "a.spz")
+    assert "of the Gaussians have colours outside of its range" in loss_text(caplog)
+    cut = scene.replace(
+        features_dc=scene.features_dc.clamp(COLOURS.low, COLOURS.high), features_rest=scene.features_rest.clamp(-1, 1)
+    )
+    with torch.no_grad():
+        cut_apart = float(ps.psnr(ps.render(cut, views()), ps.render(scene, views())).mean())
+    assert after > cut_apart + 6  # 12 dB in a whole room
+
+
+def test_compressed_ply_names_colours_that_widen_the_bounds_of_their_chunks(tmp_path, caplog):
+    psnr_of_file(with_dark(room(), lobes=True), tmp_path / "a.compressed.ply")
+    assert "of the colours are rounded to 0.02" in loss_text(caplog)
+
+
+def test_compressed_ply_names_positions_that_share_a_chunk_with_far_ones(tmp_path, caplog):
+    psnr_of_file(with_floaters(room()), tmp_path / "a.compressed.ply")
+    assert "of the Gaussians are rounded by more than their size" in loss_text(caplog)
+
+
+def test_a_splat_names_sh_and_antialiasing_that_it_does_not_hold(tmp_path, caplog):
+    ps.save(room().replace(antialiased=True), tmp_path / "a.splat")
+    text = loss_text(caplog)
+    assert "SH of degree 1 are left out" in text and "the mark of antialiased training" in text
+    assert text.endswith(".sog keeps it") and str(tmp_path / "a.splat") in text
+
+
+def test_colours_within_ranges_look_more_alike_than_colours_that_are_cut():
+    scene = cloud(400, 3, 3)
+    scene = scene.replace(features_dc=3 * scene.features_dc - 8, features_rest=12 * scene.features_rest)
+    fitted = within_colours(scene, COLOURS, SH)
+    assert bool(COLOURS.holds(fitted.features_dc).all()) and bool(SH.holds(fitted.features_rest).all())
+    wanted, got, cut = (
+        seen_colours(one.features_dc, one.features_rest.transpose(1, 2))
+        for one in (
+            scene,
+            fitted,
+            scene.replace(
+                features_dc=scene.features_dc.clamp(COLOURS.low, COLOURS.high),
+                features_rest=scene.features_rest.clamp(SH.low, SH.high),
+            ),
+        )
+    )
+    errors, of_cut = ((one - wanted).square().mean(dim=2) for one in (got, cut))
+    assert bool((errors <= of_cut + 1e-6).all()) and float(errors.mean()) < 0.7 * float(of_cut.mean())
+
+
+@pytest.mark.parametrize("value", [-1e30, -20.0, 1e30])
+def test_colours_of_any_size_are_brought_into_range_without_nan(value):
+    scene = cloud(4, 0, 3)
+    scene = scene.replace(features_dc=torch.full((4, 3), value), features_rest=scene.features_rest * abs(value))
+    for colours, sh in ((COLOURS, SH), (FLOAT, SH)):
+        fitted = within_colours(scene, colours, sh)
+        assert bool(fitted.features_dc.isfinite().all()) and bool(sh.holds(fitted.features_rest).all())
+    for kind in WRITTEN:
+        losses(scene, kind.capacity)
+
+
+def test_black_from_everywhere_rises_and_its_sh_stay():
+    scene = cloud(50, 0, 3).replace(features_dc=torch.full((50, 3), -20.0))
+    fitted = within_colours(scene, FLOAT, FLOAT)
+    assert torch.equal(fitted.features_rest, scene.features_rest)
+    assert float(fitted.features_dc.min()) > -8
+    assert float(seen_colours(fitted.features_dc, fitted.features_rest.transpose(1, 2)).max()) == 0.0
+
+
+@pytest.mark.parametrize("kind", WRITTEN, ids=lambda kind: kind.suffix)
+def test_every_number_in_the_declared_range_comes_back_within_half_a_step(tmp_path, kind):
+    holds, n = kind.capacity, 500
+    generator = torch.Generator().manual_seed(1)
+
+    def numbers(span, low, high, *shape):
+        low, high = max(span.low, low), min(span.high, high)
+        values = low + (high - low) * torch.rand(*shape, generator=generator)
+        values.flatten()[0], values.flatten()[-1] = low, high
+        return values
+
+    scene = ps.Gaussians(
+        means=2 * torch.rand(n, 3, generator=generator),
+        scales=numbers(holds.sizes, -12.0, 4.0, n, 3),
+        quats=torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1),
+        opacities=numbers(FLOAT, -6.0, 6.0, n, 1),
+        features_dc=numbers(holds.colours, -3.0, 10.0, n, 3),
+        features_rest=numbers(holds.sh, -6.0, 6.0, n, 15, 3) if holds.sh else torch.zeros(n, 0, 3),
+    )
+    ps.save(scene, tmp_path / f"a{kind.suffix}")
+    before, after = scene if kind.order is None else scene[kind.order(scene)], ps.load(tmp_path / f"a{kind.suffix}")
+
+    def within(span, one, other, wider=1.0):
+        exact = 3e-6 * max(1.0, float(one.abs().max()))
+        assert float((one - other).abs().max()) <= wider * span.step / 2 + exact
+
+    if not holds.sizes.how:
+        within(holds.sizes, before.scales, after.scales)
+    if not holds.colours.how:
+        within(holds.colours, before.features_dc, after.features_dc)
+    if not (holds.sh is None or holds.sh.how):
+        # SPZ is written with 6 and 5 bits, and reads 8. The ends of the compressed PLY's are half a step longer.
+        wider = {".spz": 8.0, ".compressed.ply": 2.0}.get(kind.suffix, 1.0)
+        within(holds.sh, before.features_rest, after.features_rest, wider)
+    within(holds.opacities, before.alphas, after.alphas)
+    unit = torch.nn.functional.normalize(after.quats, dim=1)
+    unit = unit * (unit * before.quats).sum(dim=1, keepdim=True).sign()
+    # The largest component follows from the others, each off by half a step.
+    within(holds.rotations, before.quats, unit, 4.0)
+    steps = 0 if holds.position_steps is None else holds.position_steps(before)[:, None]
+    assert bool(((before.means - after.means).abs() <= 0.51 * steps + 1e-6).all())
+
+
+@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
+def test_splats_that_others_published_fit_into_every_format():
+    names = [folder for folder in sorted(SPLATS.iterdir()) if folder.is_dir() and folder.name != "__pycache__"]
+    for folder in names:
+        files = [path for path in folder.iterdir() if path.suffix in (".ply", ".spz", ".sog")]
+        scene = ps.load(files[0] if files else folder).replace(antialiased=False)
+        for kind in WRITTEN:
+            if kind.suffix != ".splat" or not scene.sh_degree:
+                assert losses(scene, kind.capacity) == [], (folder.name, kind.suffix)
+
+
+def test_a_folder_of_scenes_names_results_that_lose_something(tmp_path, caplog):
+    ps.save(in_units(cloud(30), 1e-3), tmp_path / "in" / "a.ply")
+    with caplog.at_level(logging.WARNING):
+        convert_folder(tmp_path / "in", tmp_path / "out", suffix=".spz")
+    assert loss_text(caplog).startswith(str(tmp_path / "out" / "a.spz"))
+
+
+def test_formats_that_keep_a_scene_lose_nothing_themselves():
+    lossy = losses(in_units(room(), 1e-4), format_to_write(".spz").capacity)
+    assert lossy and not losses(in_units(room(), 1e-4), format_named(".sog").capacity)
+    extreme = cloud(20).replace(means=torch.full((20, 3), 3e38), scales=torch.full((20, 3), -87.0))
+    assert losses(extreme, format_named(".ply").capacity) == []
