@@ -51,13 +51,8 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
         return scene, ""
     centre = scene.means[~far].double().median(dim=0).values
     ways = scene.means[far].double() - centre
-    room = torch.where(ways < 0, -reach - centre, reach - centre)
-    share = (
-        (room / torch.where(ways == 0, torch.ones_like(ways), ways))
-        .where(ways != 0, torch.inf)
-        .amin(dim=1)
-        .clamp_min(1e-6)
-    )
+    room = torch.where(ways < 0, reach + centre, reach - centre)
+    share = (room / ways.abs().clamp_min(1e-300)).amin(dim=1).clamp_min(1e-6)
     means, scales = scene.means.clone(), scene.scales.clone()
     means[far] = (centre + share[:, None] * ways).float()
     scales[far] += share.log()[:, None].float()
