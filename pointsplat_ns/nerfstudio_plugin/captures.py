@@ -49,8 +49,8 @@ def train_capture(capture: Path, keep: int | None, output: Path, steps: int, sca
 
 
 def dataparser_for(capture: Path) -> DataParserConfig:
-    """The dataparser that reads a capture, by the files that it has: ScanNet++, Replica as NICE-SLAM lays it out,
-    nerfstudio's ``transforms.json``, or a COLMAP model. Raises DataError if it has none of these."""
+    """The dataparser that reads a capture, by the files that it has: ScanNet++, Replica as NICE-SLAM or Semantic-NeRF
+    lay it out, nerfstudio's ``transforms.json``, or a COLMAP model. Raises DataError if it has none of these."""
     if not capture.is_dir():
         raise DataError(f"{capture}: no such folder; expected a capture: a folder of posed photos")
     import_nerfstudio()
@@ -58,11 +58,12 @@ def dataparser_for(capture: Path) -> DataParserConfig:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
-    from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
+    from pointsplat_ns.nerfstudio_plugin.replica.layout import NICE_SLAM, SEMANTIC_NERF
+    from pointsplat_ns.nerfstudio_plugin.scannetpp import SOURCES, SeededScanNetppDataParserConfig
 
-    if (capture / "dslr").is_dir():
+    if (capture / "dslr").is_dir() or any((capture / source.transforms).is_file() for source in SOURCES):
         return SeededScanNetppDataParserConfig()
-    if (capture / "traj.txt").is_file():
+    if any((capture / names.trajectory).is_file() for names in (NICE_SLAM, SEMANTIC_NERF)):
         return ReplicaDataParserConfig()
     if (capture / "transforms.json").is_file():
         return NerfstudioDataParserConfig(load_3D_points=True)

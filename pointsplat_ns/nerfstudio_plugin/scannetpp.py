@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetpp, ScanNetppDataParserConfig
+from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -20,9 +23,39 @@ from pointsplat_ns.io.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
 
+@dataclass(frozen=True)
+class Source:
+    """Photos of a ScanNet++ scene, by their places in its folder."""
+
+    transforms: str
+    images: str
+    masks: str
+    colmap: str
+
+
+DSLR = Source("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap")
+
+SOURCES = (
+    DSLR,
+    # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
+    Source(
+        "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
+        "dslr/colmap",
+    ),
+    Source("nerfstudio/transforms.json", "images", "masks", "colmap"),
+    Source("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
+)  # fmt: skip
+"""All that a scene may have. The first whose photos are there is used."""
+
+
 @dataclass
 class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
-    """ScanNet++ without the frames that it marks as bad, and with COLMAP's points, from which Splatfacto starts"""
+    """ScanNet++ without the frames that it marks as bad, and with COLMAP's points, from which Splatfacto starts
+
+    Without paths of your own, the first of these is used whose photos are there: photos of the DSLR, undistorted ones
+    of the dataset's toolkit, frames of the iPhone. Photos are held out by test_frames, else by train_test_lists.json.
+    Where there is neither, or the photos of the test are hidden, every tenth is held out.
+    """
 
     _target: type = field(default_factory=lambda: SeededScanNetpp)
     """target class to instantiate"""
@@ -30,64 +63,50 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
     """Leave out frames with is_bad: blurred ones, or with shadows of the photographer."""
     load_seed_points: bool = True
     """Start from COLMAP's points."""
-    colmap_path: Path = Path("dslr/colmap")
+    colmap_path: Path = Path(DSLR.colmap)
     """Relative path to COLMAP's images and points3D, as text or binary files."""
+    train_split_fraction: float | None = None
+    """Train on this share of all photos and hold out the others, evenly spread, whatever the lists say."""
 
 
 @dataclass
 class SeededScanNetpp(ScanNetpp):
-    """nerfstudio's ScanNet++ dataparser, which uses bad frames and gives no seed points.
+    """nerfstudio's ScanNet++ dataparser, which needs test_frames and all photos, uses bad frames and gives no seed
+    points.
 
-    The frame of all poses is nerfstudio's; bad ones count in its orientation, centre and scale, as there.
+    The frame of all poses is nerfstudio's; bad and hidden ones count in its orientation, centre and scale, as there.
     """
 
     config: SeededScanNetppDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:  # type: ignore[override]
-        """See the base class. ``split`` is "train" for ``frames``, "val" or "test" for ``test_frames``. Raises
-        DataError if ``transforms.json`` or COLMAP's files cannot be used."""
-        frames = self._frames()
-        outputs = super()._generate_dataparser_outputs(split)
-        if self.config.skip_bad:
-            outputs = self._without(outputs, {name for name, frame in frames.items() if frame.get("is_bad")}, split)
-        if split == "train" and self.config.load_seed_points:
-            outputs.metadata.update(self._seed_points(frames, outputs))
-        return outputs
-
-    def _frames(self) -> dict[str, dict[str, Any]]:
-        """Frames of both splits by the name of the photo."""
-        path = self.config.data / self.config.transforms_path
-        expected = "expected JSON with frames and test_frames, as ScanNet++ has it"
+        """See the base class. ``split`` is "train", or "val" or "test" for the photos that are held out. Raises
+        DataError if the transforms file or COLMAP's files cannot be used, or photos are missing."""
+        given, located = self.config, _located(self.config)
+        photos = located.data / located.images_dir
+        meta, hidden = _split(located)
+        frames = {frame["file_path"]: frame for frame in (*meta["frames"], *meta["test_frames"])}
         try:
-            meta = json.loads(read_text(path, 1 << 28))
-            return {frame["file_path"]: frame for frame in (*meta["frames"], *meta["test_frames"])}
-        except FileNotFoundError as error:
-            raise DataError(f"{path}: no such file; {expected}; --data names the scene's folder") from error
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{path}: {type(error).__name__}: {error}; {expected}") from error
-
-    def _without(self, outputs: DataparserOutputs, bad: set[str], split: str) -> DataparserOutputs:
-        """The outputs without bad frames."""
-        photos = self.config.data / self.config.images_dir
-        kept = [i for i, path in enumerate(outputs.image_filenames) if str(path.relative_to(photos)) not in bad]
-        count = len(outputs.image_filenames)
-        if len(kept) == count:
-            return outputs
-        if not kept:
-            raise DataError(
-                f"{self.config.data / self.config.transforms_path}: all {count} frames of the {split} split are marked "
-                "is_bad; expected one that is not; --skip-bad False takes them all the same"
-            )
-        CONSOLE.log(f"{split} split: {count - len(kept)} of {count} frames are marked is_bad and left out")
-        outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
-        if outputs.mask_filenames is not None:
-            outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
-        outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
+            with tempfile.TemporaryDirectory() as folder:  # the base class reads a file
+                completed = Path(folder) / "transforms.json"
+                completed.write_text(json.dumps(meta))
+                self.config = dataclasses.replace(located, transforms_path=completed)
+                outputs = super()._generate_dataparser_outputs(split)
+        finally:
+            self.config = given
+        where = f"{located.data / located.transforms_path}: {split} split"
+        outputs = _without(outputs, hidden, photos, where, "are hidden, and left out")
+        if self.config.skip_bad:
+            bad = {name for name, frame in frames.items() if frame.get("is_bad")}
+            outputs = _without(outputs, bad, photos, where, "are marked is_bad, and left out")
+        if split == "train" and self.config.load_seed_points:
+            outputs.metadata.update(self._seed_points(frames, outputs, located.data / located.colmap_path))
         return outputs
 
-    def _seed_points(self, frames: dict[str, dict[str, Any]], outputs: DataparserOutputs) -> dict[str, Tensor]:
-        """COLMAP's points in the frame of the outputs."""
-        folder = self.config.data / self.config.colmap_path
+    def _seed_points(
+        self, frames: dict[str, dict[str, Any]], outputs: DataparserOutputs, folder: Path
+    ) -> dict[str, Tensor]:
+        """The points of a COLMAP model in the frame of the outputs."""
         if not folder.is_dir():
             CONSOLE.log(f"{folder}: no such folder, so no seed points; training starts from random ones")
             return {}
@@ -104,6 +123,85 @@ class SeededScanNetpp(ScanNetpp):
             "points3D_xyz": (placed * outputs.dataparser_scale).float(),
             "points3D_rgb": torch.from_numpy(np.array([point.rgb for point in points], dtype=np.uint8)),
         }
+
+
+def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:
+    """The config with the paths of the first source whose photos are there. It stays as it is if one of its paths was
+    given, or there is no source."""
+    places = {"transforms_path": "transforms", "images_dir": "images", "masks_dir": "masks", "colmap_path": "colmap"}
+    if all(Path(getattr(config, name)) == Path(getattr(DSLR, place)) for name, place in places.items()):
+        for source in SOURCES:
+            if (config.data / source.transforms).is_file() and (config.data / source.images).is_dir():
+                paths: dict[str, Any] = {name: Path(getattr(source, place)) for name, place in places.items()}
+                return dataclasses.replace(config, **paths)
+    return config
+
+
+def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set[str]]:
+    """The content of the transforms file with all photos either in ``frames`` or in ``test_frames``; and the names of
+    hidden photos, those of official tests, of which only the poses are published. Raises DataError if the file cannot
+    be used, or a training photo is missing."""
+    path, photos = config.data / config.transforms_path, config.data / config.images_dir
+    listed_in = path.parent.parent / "train_test_lists.json"
+    expected = "expected JSON with frames, as ScanNet++ has it"
+    try:
+        meta = json.loads(read_text(path, 1 << 28))
+        test, frames = [dict(frame) for frame in meta.get("test_frames") or []], [dict(each) for each in meta["frames"]]
+        for frame in (*frames, *test):
+            frame["file_path"] = _below(photos, frame["file_path"])
+        listed = set() if test or not listed_in.is_file() else set(json.loads(read_text(listed_in, 1 << 26))["test"])
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file; {expected}; --data names the scene's folder") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: {type(error).__name__}: {error}; {expected}") from error
+    test += [frame for frame in frames if frame["file_path"] in listed]
+    frames = [frame for frame in frames if frame["file_path"] not in listed]
+    missing = [frame["file_path"] for frame in frames if not (photos / frame["file_path"]).is_file()]
+    if missing:
+        raise DataError(
+            f"{photos}: {len(missing)} of {len(frames)} training photos are missing, first {missing[0]}; expected all "
+            f"frames of {path.name}; download them, or name their folder by --images-dir"
+        )
+    shown = [frame for frame in test if (photos / frame["file_path"]).is_file()]
+    hidden = {frame["file_path"] for frame in test} - {frame["file_path"] for frame in shown}
+    fraction = config.train_split_fraction
+    if fraction is None and not shown:
+        why = "the photos of the test are hidden" if hidden else "no photos are named for a test"
+        CONSOLE.log(f"{path}: {why}, so every tenth training photo is held out")
+        fraction = min(0.9, (len(frames) - 1.5) / len(frames)) if len(frames) > 1 else 0.9  # of few photos one
+    if fraction is not None:
+        if not 0 < fraction < 1:
+            raise DataError(f"--train-split-fraction {fraction}: expected above 0 and below 1")
+        every = sorted([*frames, *shown], key=lambda frame: frame["file_path"])
+        train, held_out = get_train_eval_split_fraction([frame["file_path"] for frame in every], fraction)
+        if len(held_out) == 0:
+            raise DataError(f"{path}: {len(every)} photos; expected enough to hold out one of them")
+        test = [every[i] for i in held_out] + [frame for frame in test if frame["file_path"] in hidden]
+        frames = [every[i] for i in train]
+    return {**meta, "frames": frames, "test_frames": test}, hidden
+
+
+def _below(photos: Path, name: str) -> str:
+    """The path of a photo in its folder, from a path that may begin with the folder's name."""
+    first, _, rest = name.partition("/")
+    return rest if rest and first == photos.name and not (photos / name).is_file() else name
+
+
+def _without(outputs: DataparserOutputs, left_out: set[str], photos: Path, where: str, are: str) -> DataparserOutputs:
+    """The outputs without some photos, by their paths below ``photos``, which is logged. Raises DataError if none is
+    left."""
+    kept = [i for i, path in enumerate(outputs.image_filenames) if str(path.relative_to(photos)) not in left_out]
+    count = len(outputs.image_filenames)
+    if len(kept) == count:
+        return outputs
+    if not kept:
+        raise DataError(f"{where}: all {count} frames {are}; expected one that is not; --skip-bad False takes bad ones")
+    CONSOLE.log(f"{where}: {count - len(kept)} of {count} frames {are}")
+    outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
+    if outputs.mask_filenames is not None:
+        outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
+    outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
+    return outputs
 
 
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:

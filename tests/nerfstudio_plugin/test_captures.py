@@ -19,6 +19,7 @@ from nerfstudio.engine.trainer import Trainer
 
 from captures import BAD, FRAMES, HELD_OUT, SEEDS, Capture, Lens, colors_at, seen_from
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.captures import dataparser_for
 from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.scannetpp import SeededScanNetppDataParserConfig
 
@@ -198,10 +199,10 @@ def rename_photos(scene: Path) -> None:
     [
         (spoil_pose, "poses of 10 photos are not those of transforms.json.*--load-seed-points False"),
         (rename_photos, "knows none of the 10 photos by name"),
-        (mark_all, "all 7 frames of the train split are marked is_bad.*--skip-bad False"),
+        (mark_all, "train split: all 7 frames are marked is_bad.*--skip-bad False"),
         (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
         (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
-        (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*test_frames"),
+        (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),
         (lambda scene: (scene / TRANSFORMS).write_text("{}"), "KeyError: 'frames'; expected JSON with frames"),
         (lambda scene: (scene / TRANSFORMS).write_text("{"), "transforms.json: JSONDecodeError"),
     ],
@@ -209,4 +210,88 @@ def rename_photos(scene: Path) -> None:
 def test_what_cannot_be_used_is_named(own_scene, spoil, message):
     spoil(own_scene)
     with pytest.raises(DataError, match=message):
+        parsed(own_scene)
+
+
+def change(scene: Path, **values) -> None:
+    """Change entries of transforms.json; None removes one."""
+    meta = json.loads((scene / TRANSFORMS).read_text()) | values
+    (scene / TRANSFORMS).write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
+
+
+def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, capsys):
+    """Official test scenes publish the poses of their test photos alone."""
+    for number in HELD_OUT:
+        (own_scene / f"dslr/resized_images/{number:05d}.png").unlink()
+        (own_scene / f"dslr/resized_anon_masks/{number:05d}.png").unlink()
+    train, held_out = parsed(own_scene, skip_bad=False), parsed(own_scene, "test", skip_bad=False)
+    assert len(numbers(held_out)) >= 1 and not {*numbers(train)} & {*numbers(held_out)}
+    assert {*numbers(train), *numbers(held_out)} == {*range(FRAMES)} - {*HELD_OUT}
+    assert torch.equal(train.dataparser_transform, parsed(scene).dataparser_transform), (
+        "hidden poses count in the frame"
+    )
+    assert "photos of the test are hidden" in " ".join(capsys.readouterr().out.split())
+
+
+def test_photos_are_held_out_by_the_lists_where_there_are_no_test_frames(own_scene, scene):
+    meta = json.loads((own_scene / TRANSFORMS).read_text())
+    change(own_scene, frames=meta["frames"] + meta["test_frames"], test_frames=None)
+    lists = {"train": [frame["file_path"] for frame in meta["frames"]], "has_masks": True}
+    lists["test"] = [frame["file_path"] for frame in meta["test_frames"]]
+    (own_scene / "dslr/train_test_lists.json").write_text(json.dumps(lists))
+    for split in ("train", "test"):
+        assert numbers(parsed(own_scene, split)) == numbers(parsed(scene, split))
+
+
+def test_without_lists_every_tenth_photo_is_held_out(own_scene):
+    meta = json.loads((own_scene / TRANSFORMS).read_text())
+    change(own_scene, frames=meta["frames"] + meta["test_frames"], test_frames=None)
+    assert len(numbers(parsed(own_scene, "test", skip_bad=False))) == 1
+    assert len(numbers(parsed(own_scene, skip_bad=False))) == FRAMES - 1
+
+
+def test_a_fraction_splits_as_nerfstudio_splits_colmap_models(scene, tmp_path):
+    data = as_colmap(Capture(Lens()), tmp_path / "colmap")
+    theirs = ColmapDataParserConfig(data=data, eval_mode="fraction", train_split_fraction=0.7, downscale_factor=1)
+    for split in ("train", "test"):
+        ours = parsed(scene, split, skip_bad=False, train_split_fraction=0.7)
+        assert numbers(ours) == numbers(theirs.setup().get_dataparser_outputs(split))
+    with pytest.raises(DataError, match="--train-split-fraction 1: expected above 0"):
+        parsed(scene, train_split_fraction=1)
+
+
+@pytest.mark.parametrize("kind", ["undistorted by OpenCV", "undistorted by COLMAP", "iPhone"])
+def test_what_the_toolkit_writes_is_read(own_scene, scene, kind):
+    dslr = own_scene / "dslr"
+    if kind == "undistorted by OpenCV":
+        moves = {"resized_images": "undistorted_images", "resized_anon_masks": "undistorted_anon_masks"}
+        for before, after in moves.items():
+            (dslr / before).rename(dslr / after)
+        change(own_scene, camera_model="PINHOLE", **dict.fromkeys(("k1", "k2", "k3", "k4"), 0.0))
+        (own_scene / TRANSFORMS).rename(own_scene / "dslr/nerfstudio/transforms_undistorted.json")
+    else:
+        root = own_scene / "iphone" if kind == "iPhone" else own_scene
+        root.mkdir(exist_ok=True)
+        photos, masks = ("rgb", "rgb_masks") if kind == "iPhone" else ("images", "masks")
+        meta = json.loads((own_scene / TRANSFORMS).read_text())
+        for frame in (*meta["frames"], *meta["test_frames"]):
+            frame["file_path"] = f"{photos}/{frame['file_path']}"
+        (own_scene / TRANSFORMS).write_text(json.dumps(meta))
+        for before, after in {
+            "resized_images": photos, "resized_anon_masks": masks, "nerfstudio": "nerfstudio", "colmap": "colmap",
+        }.items():  # fmt: skip
+            (dslr / before).rename(root / after)
+        dslr.rmdir()
+    assert isinstance(dataparser_for(own_scene), SeededScanNetppDataParserConfig)
+    for split in ("train", "test"):
+        ours, plain = parsed(own_scene, split), parsed(scene, split)
+        assert numbers(ours) == numbers(plain) and all(path.is_file() for path in ours.image_filenames)
+        assert all(path.is_file() for path in ours.mask_filenames)
+        assert torch.equal(ours.cameras.camera_to_worlds, plain.cameras.camera_to_worlds)
+        assert ("points3D_xyz" in ours.metadata) == (split == "train")
+
+
+def test_a_missing_training_photo_is_named(own_scene):
+    (own_scene / "dslr/resized_images/00001.png").unlink()
+    with pytest.raises(DataError, match="1 of 7 training photos are missing, first 00001.png.*--images-dir"):
         parsed(own_scene)

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.nerfstudio_plugin.captures import dataparser_for
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig, fuse_depth, read_eval_list
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from replica_scenes import CAMERA, line_of, write_scene
@@ -167,7 +168,7 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
         (removed("traj.txt"), ["traj.txt: not found"]),
         (removed("cam_params.json"), ["s/cam_params.json", "rooms/cam_params.json"]),
         (removed("results/frame000002.png"), ["4 poses for 3 photos", "missing: frame000002"]),
-        (removed("results/depth000001.png"), ["1 of 4 photos have no depth image (depth000001.png)"]),
+        (removed("results/depth000001.png"), ["1 of 4 photos have no depth image (frame000001.png)"]),
         (pictured("frame000001.jpg"), ["frame000001.jpg and frame000001.png have the same number"]),
         (pictured("frame000001.png", size=(9, 6)), ["frame000001.png: 9 x 6 pixels; expected 8 x 6"]),
         (lambda scene: (scene / "results/frame000001.png").write_bytes(b""), ["not a readable picture"]),
@@ -234,3 +235,31 @@ def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(sc
         loaded = load_replica(scene)
     assert loaded.numbers == (0, 2, 3) and np.isfinite(loaded.poses.astype(np.float32)).all()
     assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text
+
+
+def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
+    """``Sequence_1`` of Semantic-NeRF's Replica: other names, depth in millimetres, a field of view of 90 degrees."""
+    sequence = tmp_path / "room_0" / "Sequence_1"
+    for folder in ("rgb", "depth"):
+        (sequence / folder).mkdir(parents=True)
+    ours = load_replica(row)
+    for number, (photo, depth) in enumerate(zip(ours.photos, ours.depths, strict=True)):
+        Image.open(photo).save(sequence / "rgb" / f"rgb_{number}.png")
+        values = np.round(1000 * read_depth(depth, ours.params)).astype(np.uint16)
+        Image.fromarray(values).save(sequence / "depth" / f"depth_{number}.png")
+    (sequence / "traj_w_c.txt").write_bytes((row / "traj.txt").read_bytes())
+    theirs = load_replica(sequence)
+    width, height = theirs.params.width, theirs.params.height
+    assert len(theirs) == len(ours) == 12 and np.array_equal(theirs.poses, ours.poses)
+    assert [path.name for path in theirs.photos][9:] == ["rgb_9.png", "rgb_10.png", "rgb_11.png"]
+    assert theirs.params.fx == theirs.params.fy == width / 2
+    assert theirs.params.principal_point() == (width / 2, height / 2)
+    both = read_depth(theirs.depths[3], theirs.params), read_depth(ours.depths[3], ours.params)
+    assert np.allclose(*both, atol=6e-4), "half a millimetre of rounding"
+    assert np.array_equal(read_photo(theirs.photos[3], theirs.params), read_photo(ours.photos[3], ours.params))
+    assert len(parse(sequence).image_filenames) == 10 and len(parse(sequence, "test").image_filenames) == 2
+    assert isinstance(dataparser_for(sequence), ReplicaDataParserConfig)
+    with pytest.raises(DataError, match="it contains the scenes Sequence_1: name one of them"):
+        load_replica(sequence.parent)
+    (sequence / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    assert load_replica(sequence).params.fx == CAMERA["fx"]

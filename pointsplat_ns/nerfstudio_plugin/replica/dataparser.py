@@ -1,4 +1,4 @@
-"""nerfstudio dataparser for the NICE-SLAM Replica layout (``replica-data``)."""
+"""nerfstudio dataparser for the Replica layouts of NICE-SLAM and of Semantic-NeRF (``replica-data``)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from pointsplat_ns.system.progress import tracked
 
 @dataclass
 class ReplicaDataParserConfig(DataParserConfig):
-    """Posed photos, with or without depth images, in NICE-SLAM's Replica layout"""
+    """Posed photos, with or without depth images, in NICE-SLAM's or Semantic-NeRF's Replica layout"""
 
     _target: type = field(default_factory=lambda: ReplicaDataParser)
     """target class to instantiate"""
     data: Path = Path("data/replica/office0")
-    """Scene folder, with traj.txt and results/; cam_params.json in it or in the folder above."""
+    """Scene folder, with traj.txt and results/ (cam_params.json in it or in the folder above), or a sequence with
+    traj_w_c.txt and rgb/."""
     frame_stride: int = 1
     """Use every n-th frame, in the order of their numbers. Frames of eval_frames or eval_list are always used."""
     eval_every: int = 10

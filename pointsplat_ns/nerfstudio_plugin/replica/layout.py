@@ -1,66 +1,68 @@
-"""Reads and checks scenes in NICE-SLAM's Replica layout.
+"""Reads and checks scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF.
 
-A scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
+NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
 axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
 ``results/depth*.png`` (16 bit; depth along the optical axis = value / ``scale``; 0 unknown). The
 intrinsics are in ``cam_params.json``, in the scene folder or in the one above it. Poses belong to
 frames by order: line k is the pose of the k-th frame by number.
 
+Semantic-NeRF: a sequence (``room_0/Sequence_1``) holds ``traj_w_c.txt``, ``rgb/rgb_0.png`` and so on, and optionally
+``depth/depth_0.png`` (16 bit, millimetres), with poses as above. Its cameras have a horizontal field of view of 90
+degrees, which no file says; a ``cam_params.json`` overrides it.
+
 nerfstudio is not imported.
 """
 
-import json
 import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import one_line, read_text
+from pointsplat_ns.io.files import read_text
+from pointsplat_ns.nerfstudio_plugin.replica.cam_params import (
+    FARTHEST,
+    PinholeParams,
+    cam_params_paths,
+    read_cam_params,
+)
 
 logger = logging.getLogger(__name__)
 
-FARTHEST = 1e18
-"""Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
-
-PixelCenters = Literal["auto", "integer", "half"]
-
 
 @dataclass(frozen=True)
-class PinholeParams:
-    """Intrinsics as in ``cam_params.json``, without a pixel-centre correction.
+class FileNames:
+    """Names of the files in a scene folder."""
 
-    Attributes:
-        width, height: Image size in pixels.
-        fx, fy, cx, cy: Focal lengths and principal point in pixels.
-        scale: Raw depth counts per scene unit.
-        path: The file they come from.
-    """
+    trajectory: str
+    photos: str
+    """Folder of the photos."""
+    photo: str
+    """Pattern of a photo's name, with its number as the first group."""
+    depths: str
+    """Folder of the depth images."""
+    depth: str
+    """Pattern of a depth image's name, likewise."""
+    example: str
+    """A photo's path."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    scale: float
-    path: Path
 
-    def principal_point(self, centers: PixelCenters = "auto") -> tuple[float, float]:
-        """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
+NICE_SLAM = FileNames(
+    "traj.txt", "results", r"frame(\d+)\.(?:jpg|jpeg|png)", "results", r"depth(\d+)\.png", "results/frame000000.jpg"
+)
+SEMANTIC_NERF = FileNames(
+    "traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png", "rgb/rgb_0.png"
+)
 
-        There are two conventions. ``integer``: the centre of the first pixel is 0, so the middle of an image 1200 wide
-        is 599.5, as in Replica's own file and in OpenCV; half a pixel is added. ``half``: coordinates start at the
-        corner of the image, whose middle is then w / 2; nothing is added. ``auto`` chooses ``half`` if the principal
-        point is exactly (w / 2, h / 2), and ``integer`` otherwise.
-        """
-        if centers == "auto":
-            centers = "half" if (self.cx, self.cy) == (self.width / 2, self.height / 2) else "integer"
-        shift = 0.5 if centers == "integer" else 0.0
-        return self.cx + shift, self.cy + shift
+
+def file_names(folder: Path) -> FileNames | None:
+    """The layout of a scene folder, by its trajectory or photos; None if it is none."""
+    for names in (NICE_SLAM, SEMANTIC_NERF):
+        if (folder / names.trajectory).is_file():
+            return names
+    return NICE_SLAM if (folder / NICE_SLAM.photos).is_dir() else None
 
 
 @dataclass(frozen=True)
@@ -105,49 +107,54 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
     DataError names a file that is missing, unreadable or inconsistent.
     """
     folder = Path(folder)
-    hint = "a scene folder holds traj.txt and results/frame*.jpg"
+    hint = "a scene folder holds traj.txt and results/frame*.jpg, or traj_w_c.txt and rgb/rgb_*.png"
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; {hint}")
-    if not (folder / "traj.txt").is_file() and not (folder / "results").is_dir():
-        scenes = sorted(p.parent.name for p in folder.glob("*/traj.txt"))
+    names = file_names(folder)
+    if names is None:
+        scenes = sorted(
+            {p.parent.name for each in (NICE_SLAM, SEMANTIC_NERF) for p in folder.glob(f"*/{each.trajectory}")}
+        )
         hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else hint
         raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
-    params = read_cam_params(folder)
-    photos = _numbered(folder / "results", r"frame(\d+)\.(jpg|jpeg|png)", "frame*.jpg or frame*.png")
+    trajectory = folder / names.trajectory
+    photos = _numbered(folder / names.photos, names.photo, f"photos such as {names.example}")
     if not photos:
-        raise DataError(f"{folder / 'results'}: no photo found; expected frame000000.jpg (or .png) and so on")
-    depths = _numbered(folder / "results", r"depth(\d+)\.png", "depth*.png")
-    poses = read_trajectory(folder / "traj.txt")
+        raise DataError(f"{folder / names.photos}: no photo found; expected {names.example} and so on")
+    has_depths = (folder / names.depths).is_dir()
+    depths = _numbered(folder / names.depths, names.depth, "depth images") if has_depths else {}
     numbers = sorted(photos)
+    params = _params(folder, names, photos[numbers[0]])
+    poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
         raise DataError(
-            f"{folder / 'traj.txt'}: {len(poses)} poses for {len(numbers)} photos in {folder / 'results'}; "
+            f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in {folder / names.photos}; "
             f"expected one line per photo{_missing_hint(numbers, len(poses))}"
         )
     if depths:
         missing = [n for n in numbers if n not in depths]
         if missing:
-            names = _some([f"depth{re.sub(r'[^0-9]', '', photos[n].stem)}.png" for n in missing])
+            lacking = _some([photos[n].name for n in missing])
             raise DataError(
-                f"{folder / 'results'}: {len(missing)} of {len(numbers)} photos have no depth image ({names}); "
-                "restore them, or remove all depth*.png to go without depth"
+                f"{folder / names.depths}: {len(missing)} of {len(numbers)} photos have no depth image ({lacking}); "
+                "restore them, or remove all depth images to go without depth"
             )
     finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
     if not finite.all():
         lines = [int(i) + 1 for i in np.flatnonzero(~finite)]
         if not finite.any():
             raise DataError(
-                f"{folder / 'traj.txt'}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}"
+                f"{trajectory}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}"
             )
         logger.warning(
             "%s: %d of %d poses hold NaN, Inf or numbers beyond 1e18 (line %s): their frames are left out",
-            folder / "traj.txt",
+            trajectory,
             len(lines),
             len(poses),
             _some([str(i) for i in lines]),
         )
     keep = [int(i) for i in np.flatnonzero(finite)]
-    rigid = _rigid(poses[keep], [i + 1 for i in keep], folder / "traj.txt")
+    rigid = _rigid(poses[keep], [i + 1 for i in keep], trajectory)
     numbers = [numbers[i] for i in keep]
     scene = ReplicaScene(
         folder=folder,
@@ -163,43 +170,12 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
     return scene
 
 
-def read_cam_params(folder: Path) -> PinholeParams:
-    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it. Raises DataError if there is
-    none, it is not JSON, or a number is missing or out of range."""
-    candidates = [folder / "cam_params.json", folder.absolute().parent / "cam_params.json"]
-    path = next((p for p in candidates if p.is_file()), None)
-    if path is None:
-        raise DataError(
-            f"{candidates[0]}: not found, nor {candidates[1]}; expected intrinsics "
-            '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} in one of them'
-        )
-    try:
-        camera = json.loads(read_text(path))["camera"]
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)}); expected a camera's intrinsics") from None
-    except (KeyError, TypeError):
-        raise DataError(f'{path}: no "camera" entry; expected {{"camera": {{"w": ..., "h": ...}}}}') from None
-    values: dict[str, float] = {}
-    for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"):
-        value = camera.get(key) if isinstance(camera, dict) else None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DataError(f'{path}: camera "{key}" is {value!r:.40}; expected a number')
-        if not abs(value) < FARTHEST or (value <= 0 and key not in ("cx", "cy")):  # NaN fails too
-            raise DataError(f'{path}: camera "{key}" is {value!s:.40}; expected a positive number')
-        values[key] = float(value)
-    for key in ("w", "h"):
-        if values[key] != int(values[key]):
-            raise DataError(f'{path}: camera "{key}" is {values[key]}; expected a whole number of pixels')
-    return PinholeParams(
-        width=int(values["w"]),
-        height=int(values["h"]),
-        fx=values["fx"],
-        fy=values["fy"],
-        cx=values["cx"],
-        cy=values["cy"],
-        scale=values["scale"],
-        path=path,
-    )
+def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
+    """Intrinsics of a scene: those of its file, or those that all sequences of Semantic-NeRF have."""
+    if names is SEMANTIC_NERF and not any(path.is_file() for path in cam_params_paths(folder)):
+        width, height = _open_image(photo).size
+        return PinholeParams(width, height, width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, 1000.0, photo)
+    return read_cam_params(folder)
 
 
 def read_trajectory(path: Path) -> np.ndarray:
