@@ -178,6 +178,41 @@ def _some(keys: Iterable[Any], count: int) -> str:
     return (", ".join(names[:count]) or "none") + (f" and {len(names) - count} more" if len(names) > count else "")
 
 
+@dataclass(frozen=True, eq=False)
+class PhotoFit:
+    """What a training learned about each of its photos, beside the scene."""
+
+    adjustments: Tensor | None
+    """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation vector in radians;
+    None if poses were not corrected."""
+    colors: str
+    """Key of the parameters that change the colours of each photo, such as a bilateral grid; empty if there are none."""
+
+
+def read_photo_fit(path: Path | str) -> PhotoFit:
+    """Read what a Splatfacto checkpoint holds about each training photo. Loads as :func:`read_checkpoint`.
+
+    Raises:
+        SceneError: if the file is no checkpoint, or its corrections of poses are not (C, 6) finite numbers.
+    """
+    path = require_file(path, "a Splatfacto checkpoint")
+    state = _pipeline_state(_load(path), path)
+    names = [key for key in state if isinstance(key, str)]
+    key = next((name for name in names if name.endswith("camera_optimizer.pose_adjustment")), None)
+    adjustments = None if key is None else _parameter(state[key], key, path, path.stat().st_size)
+    if adjustments is not None and not _is_adjustment(adjustments):
+        raise SceneError(
+            f"{path}: {key!r} of shape {tuple(adjustments.shape)}; expected six finite numbers for each training photo"
+        )
+    words = re.compile(r"bil_?grid|bilateral|appearance|embed|exposure")
+    colors = next((name for name in sorted(names) if name.startswith("_model.") and words.search(name)), "")
+    return PhotoFit(adjustments, colors)
+
+
+def _is_adjustment(values: Tensor) -> bool:
+    return values.dim() == 2 and values.shape[1] == 6 and bool(values.isfinite().all())
+
+
 def is_complete(path: Path) -> bool:
     """Whether a checkpoint's archive is complete, that is, has the directory at its end."""
     try:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 
 def dataset_views(path: Path | str, split: Split = "train") -> Views:
-    """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in.
+    """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in; those of
+    training photos as the training corrected them.
 
     Needs nerfstudio, which takes a few seconds to import.
 
@@ -57,6 +58,8 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     they show once undistorted. Arguments and errors are those of :func:`dataset_views`; a photo that cannot be used is
     a DataError."""
     scene, frames = _open(path, split)
+    if split == "train":
+        _need_as_rendered(scene)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]
     photos = [in_unit_range(data["image"][..., :3]).float() for _, data in shown]
@@ -83,6 +86,7 @@ def training_photos(path: Path | str) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
     scene, frames = _open(path, "train", cached=True)
+    _need_as_rendered(scene)
     _views_of(scene, frames, "train")
     return TrainingPhotos(scene, frames)
 
@@ -118,6 +122,12 @@ def _open(path: Path | str, split: Split, cached: bool = False) -> tuple[Trained
 
     scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share() if cached else 0))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
+
+
+def _need_as_rendered(scene: TrainedScene) -> None:
+    from pointsplat_ns.nerfstudio_plugin.corrected_poses import need_photos_as_rendered
+
+    need_photos_as_rendered(scene.run, "leave the photos out")
 
 
 def _views_of(scene: TrainedScene, frames: Frames, split: Split) -> Views:

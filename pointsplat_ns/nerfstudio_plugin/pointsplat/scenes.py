@@ -24,6 +24,7 @@ from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
 from pointsplat_ns.io.runs import Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
+from pointsplat_ns.nerfstudio_plugin.corrected_poses import corrected_poses, need_photos_as_rendered
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
 from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
@@ -132,11 +133,15 @@ class TrainedScene(DenseScene):
     def _frames(self, split: str) -> Frames:
         scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
         scale = float(scale) if isinstance(scale, (int, float)) else 1.0
-        return Frames(UndistortedDataset(self._outputs(split), scale), cache=self.cache)
+        dataset = UndistortedDataset(self._outputs(split), scale)
+        if split == "train":
+            dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
+        return Frames(dataset, cache=self.cache)
 
     @cached_property
     def train_frames(self) -> Any:
-        """Training photos at the run's training resolution, or without data the scene's own renders."""
+        """Training photos at the run's training resolution, in the poses as the training corrected them; without data
+        the scene's own renders."""
         return self._frames("train") if self.has_photos else self.rendered_train
 
     @cached_property
@@ -191,6 +196,8 @@ def training_scenes(
                 if chosen == "photos":
                     raise SceneError(f"{error}, or take --pipeline.datamanager.supervision dense") from error
                 has_photos = False
+            if chosen == "photos":
+                need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
         scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
     scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
     return chosen, scenes
