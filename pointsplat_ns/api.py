@@ -43,7 +43,7 @@ EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
 """The shipped example scene."""
 
 
-def load(path: str | Path, scene: str | None = None) -> Gaussians:
+def load(path: str | Path, scene: str | None = None, data: str | Path | None = None) -> Gaussians:
     """Read a scene.
 
     Args:
@@ -52,6 +52,7 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
             folder or ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined as in its
             training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.
+        data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run says.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -71,7 +72,7 @@ def load(path: str | Path, scene: str | None = None) -> Gaussians:
         if scene is not None:
             raise SceneError(f"scene {scene!r}: {path} holds one scene; leave the name out")
         return read_scene(path)
-    scenes, default = scenes_of_run(open_refiner_run(path, need_data=True))
+    scenes, default = scenes_of_run(open_refiner_run(path, need_data=True, data=data))
     chosen = default if scene is None else scene
     if chosen not in scenes:
         raise SceneError(f"scene {chosen!r}: no such scene in {path}; there are {', '.join(scenes)}")
@@ -108,6 +109,7 @@ def prune(
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
@@ -134,6 +136,7 @@ def prune(
             Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
         up: the axis that is up in the scene, "z" or "-y", for sampled views; by default the scene's own, or estimated.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
@@ -152,7 +155,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
-    _, pruned, _, _ = prune_source(scene, request, views, resolution, up, progress)
+    _, pruned, _, _ = prune_source(scene, request, views, resolution, up, data, progress)
     return pruned
 
 
@@ -174,6 +177,7 @@ def compact(
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
     progress: bool | Progress = False,
 ) -> Compacted:
     """Make a scene smaller, repair it, and accept the repair by comparing renders.
@@ -207,6 +211,7 @@ def compact(
             there are more than twice as many; else it samples views in free space.
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
+        data: as for :func:`prune`.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
@@ -229,7 +234,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result, _ = compact_source(scene, request, goal, views, resolution, up, progress)
+    _, result, _ = compact_source(scene, request, goal, views, resolution, up, data, progress)
     return result
 
 
@@ -242,6 +247,7 @@ def lod(
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
     folder: str | Path | None = None,
     stream: Chunks | None = None,
     html: bool = False,
@@ -260,6 +266,7 @@ def lod(
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
+        data: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
         stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
@@ -294,7 +301,7 @@ def lod(
             else:
                 check_stream_folder(Path(folder), force, viewer.files if viewer else ())
             stack.enter_context(claimed_folder(Path(folder)))
-        dense, view_source = read_source(scene, views, resolution, up)
+        dense, view_source = read_source(scene, views, resolution, up, data)
         source = None if isinstance(scene, Gaussians) else source_file(scene)
         page = None
         if viewer is not None and folder is not None:
@@ -317,6 +324,7 @@ def plot_views(
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
 ) -> str:
     """Draw the views that decide about a scene: a sheet of up to 16 pictures.
 
@@ -326,6 +334,7 @@ def plot_views(
         views: as for :func:`prune`.
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
+        data: as for :func:`prune`.
 
     Returns:
         Text: the origin of the views, and the share of visible content in the views.
@@ -342,7 +351,7 @@ def plot_views(
         >>> "of the visible content" in text
         True
     """
-    dense, source = read_source(scene, views, resolution, up)
+    dense, source = read_source(scene, views, resolution, up, data)
     return draw_views(dense.detach().to("cpu"), source, path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from dataclasses import dataclass
@@ -37,6 +38,9 @@ ViewsInput = Views | str | Path | None
 ResolutionInput = tuple[int, int] | str | None
 """Width and height of pictures, pixels."""
 
+DataInput = str | Path | None
+"""Where the data of a run is now, if it moved: the data itself, or a folder above it."""
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -56,6 +60,7 @@ def prune_source(
     views: ViewsInput = None,
     resolution: ResolutionInput = None,
     up: str | None = None,
+    data: DataInput = None,
     progress: bool | Progress = False,
     compared: bool = False,
 ) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
@@ -68,7 +73,7 @@ def prune_source(
     from pointsplat_ns.compression.prune import prune_scene
     from pointsplat_ns.compression.quality import quality_of_pruned
 
-    dense, source = read_source(scene, views, resolution, up)
+    dense, source = read_source(scene, views, resolution, up, data)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
@@ -87,6 +92,7 @@ def compact_source(
     views: ViewsInput = None,
     resolution: ResolutionInput = None,
     up: str | None = None,
+    data: DataInput = None,
     progress: bool | Progress = False,
     compared: bool = False,
 ) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
@@ -99,12 +105,12 @@ def compact_source(
     """
     from pointsplat_ns.compression.quality import quality_if_seen
 
-    dense, source = read_source(scene, views, resolution, up)
+    dense, source = read_source(scene, views, resolution, up, data)
     with progress_bar(progress) as report:
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if request.photos is None else _training_photos(run_of(scene, None))
+            photos = None if request.photos is None else _training_photos(run_of(scene, None), data)
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
@@ -113,7 +119,7 @@ def compact_source(
 
             given = views if isinstance(views, Views) else source.given
             size, upward = parse_resolution(resolution), up_named(up)
-            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward)
+            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward, data)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
         quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
@@ -139,13 +145,21 @@ def goal_of(
 
 
 def read_source(
-    scene: Source, views: ViewsInput, resolution: ResolutionInput, up: str | None = None
+    scene: Source,
+    views: ViewsInput,
+    resolution: ResolutionInput,
+    up: str | None = None,
+    data: DataInput = None,
 ) -> tuple[Gaussians, ViewSource]:
     """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`. Raises
     SceneError if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already; DataError
     if a file of cameras is not usable, or most of them see nothing of the scene; and PointSplatError if the resolution
     or ``up`` is not valid."""
     size, upward = parse_resolution(resolution), up_named(up)
+    if data is not None:
+        from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
+
+        need_named_data(scene if views is None else views, data)
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file
 
@@ -163,7 +177,8 @@ def read_source(
     if isinstance(views, Views):
         return dense, ViewSource(dense, given=views, resolution=size, up=upward)
     run = run_of(scene, views)
-    return dense, ViewSource(dense, run=run, dataset_views=_dataset_views, resolution=size, up=upward)
+    read = functools.partial(_dataset_views, data=data)
+    return dense, ViewSource(dense, run=run, dataset_views=read, resolution=size, up=upward)
 
 
 def run_of(scene: Source, views: ViewsInput) -> Path | None:
@@ -172,7 +187,7 @@ def run_of(scene: Source, views: ViewsInput) -> Path | None:
     return Path(named) if isinstance(named, (str, Path)) else None
 
 
-def _training_photos(run: Path | None) -> Photos:
+def _training_photos(run: Path | None, data: DataInput) -> Photos:
     """The training photos of a run's dataset.
 
     Raises:
@@ -183,7 +198,7 @@ def _training_photos(run: Path | None) -> Photos:
         raise SceneError("photos are read from the dataset of a run; expected the path of a run")
     from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
 
-    return training_photos(run)
+    return training_photos(run, data)
 
 
 def log(lines: tuple[str, ...]) -> None:
@@ -192,8 +207,8 @@ def log(lines: tuple[str, ...]) -> None:
         logger.info("%s", line)
 
 
-def _dataset_views(run: Path | str) -> Views:
+def _dataset_views(run: Path | str, data: DataInput = None) -> Views:
     """The poses of a run's dataset. Read by the plugin, which is not imported before."""
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 
-    return dataset_views(run)
+    return dataset_views(run, data=data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,7 +18,7 @@ from pointsplat_ns.io.formats import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, need_named_data
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.viewing.camera_path import CAMERA_PATH, FilmSettings, camera_path
 from pointsplat_ns.viewing.film import FilmScenes, SplitScreen, render_frames
@@ -40,6 +41,7 @@ def render_path(
     split: SplitScreen = "side-by-side",
     labels: Sequence[str] | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
@@ -63,6 +65,7 @@ def render_path(
         labels: labels of two scenes; by default their names and counts. An empty list writes none.
         up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default the scene's own, or
             estimated.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels.
         fps: frames a second; by default 24, or as in the saved path.
@@ -93,6 +96,7 @@ def render_path(
     settings = FilmSettings(width, height, fps, seconds)
     upward = up_named(up)
     kind = check_output(output, force)
+    need_named_data(scene, data)
     sources = [scene] if other is None else [scene, other]
     given = views_for(scene, views).resized(CAMERA_PATH.photo_side) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
@@ -101,7 +105,7 @@ def render_path(
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
         settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))
-    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given)
+    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given, data)
     chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
@@ -116,6 +120,7 @@ def open_viewer(
     other: Source | None = None,
     *,
     up: str | None = None,
+    data: str | Path | None = None,
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Served:
@@ -129,6 +134,7 @@ def open_viewer(
             of a stream with a page (``lod(html=True)``) alone shows that page, which the browser draws.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
+        data: folder of the data of ``scene``, as for :func:`render_path`.
         host: the address to listen on; by default only this machine has access. With another address, every machine
             that reaches it has access.
         port: the first port to try; 0 takes any free port.
@@ -151,6 +157,7 @@ def open_viewer(
     from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
 
     upward = up_named(up)
+    need_named_data(scene, data)
     if isinstance(scene, (str, Path)) and other is None and up is None and is_stream_with_page(Path(scene)):
         return PageServer(Path(scene), host, port)
 
@@ -163,13 +170,17 @@ def open_viewer(
         loaded = source if isinstance(source, Gaussians) else load(source)
         path = None if isinstance(source, Gaussians) else Path(source)
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
-        scenes.append(ViewedScene(_name(source, index), path, loaded, _source(source, loaded, None), levels))
+        scenes.append(
+            ViewedScene(
+                _name(source, index), path, loaded, _source(source, loaded, None, None if index else data), levels
+            )
+        )
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 
-def _source(scene: Source, loaded: Gaussians, given: Views | None) -> ViewSource:
+def _source(scene: Source, loaded: Gaussians, given: Views | None, data: str | Path | None = None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
-    return ViewSource(loaded, given, run, dataset_views)
+    return ViewSource(loaded, given, run, functools.partial(dataset_views, data=data))
 
 
 def _name(scene: Source, index: int) -> str:

@@ -48,6 +48,7 @@ def compact_folder(
     target_ms: float | None = None,
     target_mb: float | None = None,
     resolution: tuple[int, int] | str | None = None,
+    data: str | Path | None = None,
     jobs: int = 1,
     shard: str | None = None,
     force: bool = False,
@@ -76,6 +77,8 @@ def compact_folder(
         target_ms: as for :func:`compact`.
         target_mb: as for :func:`compact`, in the format of each result.
         resolution: as for :func:`prune`.
+        data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
+            data is not found gets sampled views, and a note.
         jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
             is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
         shard: only a part of the scenes: "2/5" is the second of five.
@@ -118,12 +121,13 @@ def compact_folder(
         "effort": effort if seconds is None else None,
         "seconds": seconds,
         "resolution": None if size is None else size_text(size),
+        **({} if data is None else {"data": str(data)}),
     }
     if targets is not None:
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
-        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size)
+        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size, data)
     else:
-        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size)
+        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size, data)
     return _run(folder, target, Command("compact", make, options), jobs, shard, force, progress)
 
 
@@ -138,6 +142,7 @@ def prune_folder(
     clean: bool = False,
     fine_tune: int = 0,
     resolution: tuple[int, int] | str | None = None,
+    data: str | Path | None = None,
     jobs: int = 1,
     shard: str | None = None,
     force: bool = False,
@@ -153,8 +158,9 @@ def prune_folder(
         "clean": clean,
         "fine_tune": fine_tune,
         "resolution": None if size is None else size_text(size),
+        **({} if data is None else {"data": str(data)}),
     }
-    command = Command("prune", functools.partial(_pruned, request, size), options)
+    command = Command("prune", functools.partial(_pruned, request, size, data), options)
     return _run(folder, output, command, jobs, shard, force, progress)
 
 
@@ -201,18 +207,25 @@ def _compacted(
     device: str,
     request: CompactRequest,
     resolution: tuple[int, int] | None,
+    data: str | Path | None,
     path: Path,
 ) -> SmallerScene:
     """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
     dense, options = read_scene(path), request.prune
-    source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
+    source = _views_of(dense, path, resolution, data)
     if (whole := _kept_whole(dense, options, source)) is not None:
         return whole
     request = replace(request, prune=options.in_format(format_like(path)), refiner=_refiner_on(refiner, device))
     result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
-    return SmallerScene(result.scene, len(dense), result.psnr)
+    return SmallerScene(result.scene, len(dense), result.psnr, source.missing[2:-1])
+
+
+def _views_of(dense: Gaussians, path: Path, resolution: tuple[int, int] | None, data: str | Path | None) -> ViewSource:
+    """The views of one scene of a folder."""
+    read = functools.partial(dataset_views, data=data)
+    return ViewSource(dense, run=path, dataset_views=read, resolution=resolution)
 
 
 def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> SmallerScene | None:
@@ -224,15 +237,17 @@ def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> 
     return SmallerScene(kept, len(dense), None, note, same)
 
 
-def _pruned(request: PruneRequest, resolution: tuple[int, int] | None, path: Path) -> SmallerScene:
+def _pruned(
+    request: PruneRequest, resolution: tuple[int, int] | None, data: str | Path | None, path: Path
+) -> SmallerScene:
     """Prune one scene of a folder."""
     dense = read_scene(path)
-    source = ViewSource(dense, run=path, dataset_views=dataset_views, resolution=resolution)
+    source = _views_of(dense, path, resolution, data)
     if (whole := _kept_whole(dense, request, source)) is not None:
         return whole
     pruned = prune_scene(dense, request.in_format(format_like(path)), source)
     quality = quality_of_pruned(dense, pruned, source)
-    return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr)
+    return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr, source.missing[2:-1])
 
 
 def _converted(sh: str, up: str | None, scale: float, original_frame: bool, path: Path) -> SmallerScene:
@@ -249,12 +264,13 @@ def _found(
     by: str,
     repairs: tuple[Repair, ...],
     resolution: tuple[int, int] | None,
+    data: str | Path | None,
     path: Path,
 ) -> SmallerScene:
     """Find the cheapest version of one scene of a folder that meets targets."""
     dense = read_scene(path)
     suffix = format_like(path).suffix
-    subject = subject_of(dense, path, None, _refiner_on(refiner, device), suffix, resolution)
+    subject = subject_of(dense, path, None, _refiner_on(refiner, device), suffix, resolution, data=data)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene

@@ -20,6 +20,7 @@ from pointsplat_ns.cli.printing import (
 )
 from pointsplat_ns.cli.scene_options import (
     Bands,
+    Data,
     Megabytes,
     Output,
     Poses,
@@ -56,6 +57,7 @@ def compact(
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
+    data: Data = None,
     picture: Path | None = None,
     html: Path | None = None,
     html_limit: Megabytes = 60.0,
@@ -106,6 +108,8 @@ def compact(
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
             file's own, or an estimate. Write --up=-y for a negative axis.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says. In a folder
+            of scenes, a run whose data is not found gets sampled views, which its note says.
         picture: a .png file for images of some views: dense, before and after the repair, side by side; by default
             none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
@@ -133,8 +137,8 @@ def compact(
         return folder_command(
             ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
             keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, shard=shard,
-            force=force,
+            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, data=data,
+            shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import compact_source, goal_of
@@ -153,7 +157,7 @@ def compact(
     goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
-            scene, request, goal, poses, resolution, up, progress=True, compared=True
+            scene, request, goal, poses, resolution, up, data, progress=True, compared=True
         )
     if not dry_run:
         ps.save(result.scene, output, progress=True)

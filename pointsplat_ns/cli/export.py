@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
-from pointsplat_ns.cli.scene_options import claim_outputs
+from pointsplat_ns.cli.scene_options import Data, claim_outputs
 from pointsplat_ns.system.quantities import seconds_text
 
 
@@ -17,6 +17,7 @@ def export(
     run: tyro.conf.Positional[Path],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     scene: str | None = None,
+    data: Data = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
@@ -26,6 +27,7 @@ def export(
         run: the run's folder, config.yml or checkpoint.
         output: the file to write, of any format as for prune.
         scene: name of a scene of a pointsplat run; by default the first held-out one, or else the first.
+        data: folder of the scenes of a pointsplat run, or one above it, if they are no longer where the run says.
         force: overwrite an existing file.
         json_output: print the result as JSON, and nothing else on standard output.
     """
@@ -33,7 +35,7 @@ def export(
 
     claim_outputs(output, force)
     start = time.perf_counter()
-    exported = ps.load(run, scene)
+    exported = ps.load(run, scene, data)
     ps.save(exported, output, progress=True)
     seconds = time.perf_counter() - start
     if json_output:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Resolution, Up, claim_outputs
+from pointsplat_ns.cli.scene_options import Data, Resolution, Up, claim_outputs
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.scene_info import SceneInfo
@@ -20,6 +20,7 @@ def info(
     views: Path | None = None,
     resolution: Resolution = None,
     up: Up = None,
+    data: Data = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
@@ -34,6 +35,8 @@ def info(
             1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
             file's own, or an estimate. Write --up=-y for a negative axis.
+        data: for the sheet of a run: folder of its photos and poses, or one above it, if it is no longer where the run
+            says.
         force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output: an object, or a list for several scenes.
     """
@@ -54,7 +57,7 @@ def info(
                 raise
             print(f"error: {error}", file=sys.stderr)
             failed.append({"file": str(scene), "error": str(error)})
-    sheet = None if views is None else ps.plot_views(scenes[0], views, resolution=resolution, up=up)
+    sheet = None if views is None else ps.plot_views(scenes[0], views, resolution=resolution, up=up, data=data)
     if json_output:
         rows = [*(one.as_dict() for one in found), *failed]
         print_json(rows if len(rows) > 1 else rows[0])

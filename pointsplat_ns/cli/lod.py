@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import (
     Bands,
+    Data,
     Output,
     Poses,
     Resolution,
@@ -37,6 +38,7 @@ def lod(
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
+    data: Data = None,
     force: bool = False,
     threads: int | None = None,
     json_output: Json = False,
@@ -70,6 +72,7 @@ def lod(
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
             file's own, or an estimate. Write --up=-y for a negative axis.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         force: overwrite existing files.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
@@ -87,7 +90,7 @@ def lod(
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            folder=folder, stream=chunks, html=html, force=force, progress=True,
+            data=data, folder=folder, stream=chunks, html=html, force=force, progress=True,
         )  # fmt: skip
     if json_output and stream:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})

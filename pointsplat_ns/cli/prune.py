@@ -16,6 +16,7 @@ from pointsplat_ns.cli.printing import (
 )
 from pointsplat_ns.cli.scene_options import (
     Bands,
+    Data,
     Megabytes,
     Output,
     Poses,
@@ -46,6 +47,7 @@ def prune(
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
+    data: Data = None,
     plot: Path | None = None,
     dry_run: bool = False,
     force: bool = False,
@@ -83,6 +85,8 @@ def prune(
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
             file's own, or an estimate. Write --up=-y for a negative axis.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says. In a folder
+            of scenes, a run whose data is not found gets sampled views, which its note says.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
@@ -114,7 +118,7 @@ def prune(
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
             keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
-            resolution=resolution, shard=shard, force=force,
+            resolution=resolution, data=data, shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     check_poses(poses)
@@ -137,7 +141,7 @@ def prune(
         return
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
-            scene, request, poses, resolution, up, progress=True, compared=True
+            scene, request, poses, resolution, up, data, progress=True, compared=True
         )
     if not dry_run:
         ps.save(small, output, progress=True)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Poses, Scene, check_poses, claim_file, claim_folder
+from pointsplat_ns.cli.scene_options import Data, Poses, Scene, check_poses, claim_file, claim_folder
 from pointsplat_ns.system.quantities import seconds_text
 
 
@@ -22,6 +22,7 @@ def render(
     split: Literal["side-by-side", "wipe"] = "side-by-side",
     labels: tuple[str, ...] | None = None,
     up: str | None = None,
+    data: Data = None,
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
@@ -45,6 +46,7 @@ def render(
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default the file's own,
             or an estimate. Write --up=-y for a negative axis.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels; by default in the proportion of the path or the photos.
         fps: frames a second; by default 24, or as in the saved path.
@@ -64,8 +66,8 @@ def render(
     else:
         claim_file(output, force)
     count = ps.render_path(
-        scene, output, other, path=path, views=poses, split=split, labels=labels, up=up, width=width, height=height,
-        fps=fps, seconds=seconds, force=force, progress=True,
+        scene, output, other, path=path, views=poses, split=split, labels=labels, up=up, data=data, width=width,
+        height=height, fps=fps, seconds=seconds, force=force, progress=True,
     )  # fmt: skip
     files = output.iterdir() if output.is_dir() else [output]
     size, seconds_taken = sum(file.stat().st_size for file in files), time.perf_counter() - start

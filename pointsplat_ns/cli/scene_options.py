@@ -16,6 +16,7 @@ from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_
 Scene = tyro.conf.Positional[Path]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 Poses = Path | None
+Data = Path | None
 Resolution = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
 Up = Annotated[str | None, tyro.conf.arg(metavar="AXIS")]
 Bands = Literal["all", "auto", "0", "1", "2", "3"]

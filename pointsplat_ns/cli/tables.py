@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Share, claim_folder
+from pointsplat_ns.cli.scene_options import Data, Share, claim_folder
 
 
 def tables(
@@ -24,6 +24,7 @@ def tables(
     scoring_views: int = 40,
     fine_tune: int = 300,
     splat_transform: str | None = None,
+    data: Data = None,
     force: bool = False,
     json_output: Json = False,
 ) -> None:
@@ -46,6 +47,8 @@ def tables(
         scoring_views: largest number of training poses for the scores of LightGaussian and PUP-3DGS.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
         splat_transform: path of the program; by default the one on PATH.
+        data: folder above the data of the runs, or that of one, where it is no longer where the runs say; a run whose
+            data is not found is measured without photos, with a warning.
         force: start over with the given scenes.
         json_output: print the content of tables.json, and nothing else on standard output.
     """
@@ -54,7 +57,8 @@ def tables(
     claim_folder(output)
     found = ps.measure_tables(
         scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
-        scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, force=force, progress=True,
+        scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, data=data, force=force,
+        progress=True,
     )  # fmt: skip
     if json_output:
         print_json({"output": output, **json.loads((output / "tables.json").read_text("utf-8"))})

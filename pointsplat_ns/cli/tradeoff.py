@@ -6,7 +6,17 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Megabytes, Output, Poses, Resolution, Scene, Up, check_poses, output_beside
+from pointsplat_ns.cli.scene_options import (
+    Data,
+    Megabytes,
+    Output,
+    Poses,
+    Resolution,
+    Scene,
+    Up,
+    check_poses,
+    output_beside,
+)
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
@@ -24,6 +34,7 @@ def tradeoff(
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
+    data: Data = None,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: Megabytes | None = None,
@@ -54,6 +65,7 @@ def tradeoff(
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
             file's own, or an estimate. Write --up=-y for a negative axis.
+        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
             there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
@@ -74,7 +86,7 @@ def tradeoff(
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, up=up, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
+            resolution=resolution, up=up, data=data, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
             force=force, progress=True,
         )  # fmt: skip
     if json_output:

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import tyro
 
+from pointsplat_ns.cli.scene_options import Data
+
 
 def view(
     scene: tyro.conf.Positional[Path | None] = None,
     other: tyro.conf.Positional[Path | None] = None,
     up: str | None = None,
+    data: Data = None,
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> None:
@@ -26,13 +29,14 @@ def view(
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default the file's own, or an estimate. Write
             --up=-y for a negative axis.
+        data: folder of the first scene's photos and poses, or one above it, if it is no longer where the run says.
         host: the address to listen on; by default only this machine has access. With another address, every machine
             that reaches it has access.
         port: the first port to try; 0 takes any free port.
     """
     import pointsplat_ns as ps
 
-    with ps.open_viewer(scene, other, up=up, host=host, port=port) as viewer:
+    with ps.open_viewer(scene, other, up=up, data=data, host=host, port=port) as viewer:
         print(f"{viewer.url}: open it in a browser; Ctrl-C ends it")
         print(f"it begins at {viewer.origin}" if viewer.origin else "drop a scene on the page", flush=True)
         viewer.wait()

@@ -12,7 +12,7 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import axis_along, smallest_turn
-from pointsplat_ns.io.runs import Run, may_be_run, open_run
+from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import axis_named
@@ -41,7 +41,7 @@ def place(
     Raises:
         PointSplatError: if ``up`` is not an axis, or ``scale`` is not above 0.
         DataError: if up has to be estimated, and no Gaussian is visible.
-        SceneError: if ``original_frame`` is not a run.
+        SceneError: if ``original_frame`` is not a run, or lacks its ``dataparser_transforms.json``.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -70,6 +70,11 @@ def _frame_at(path: str | Path) -> Similarity:
     if run is None or not run.is_gaussian_scene:
         raise SceneError(
             f"{path}: not a Splatfacto run; expected the folder of the run, which has the frame of its data"
+        )
+    if not (kept := run.folder / RUN_FILES.transforms).is_file():
+        raise SceneError(
+            f"{kept}: no such file, so the frame of the data is not known; nerfstudio writes it as a training begins: "
+            "copy it from the original run, or leave the frame as it is"
         )
     return run_frame(run)
 

@@ -132,9 +132,10 @@ def refiner_at(path: Path | str | None, device: torch.device | str | None = None
     return load_refiner(None if str(path) == SHIPPED else path, device)
 
 
-def open_refiner_run(path: Path | str, need_data: bool) -> Run:
-    """The ``pointsplat`` run at a path. Raises SceneError if there is none, or it is damaged or of another kind."""
-    run = open_run(path, need_data)
+def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:
+    """The ``pointsplat`` run at a path; arguments as of :func:`~pointsplat_ns.io.runs.open_run`. Raises SceneError if
+    there is none, or it is damaged or of another kind."""
+    run = open_run(path, need_data, data)
     if run.method_name != METHOD_NAMES.refiner:
         raise SceneError(
             f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD_NAMES.refiner} run"

@@ -114,13 +114,15 @@ def may_be_run(path: Path | str) -> bool:
     return path.is_dir() or path.suffix.lower() in RUN_FILES.suffixes
 
 
-def open_run(path: Path | str, need_data: bool = True) -> Run:
+def open_run(path: Path | str, need_data: bool = True, data: Path | str | None = None) -> Run:
     """The run at ``path``.
 
     Args:
         path: the run's folder, its ``config.yml``, or one of its checkpoints (which is then the one used).
         need_data: look for the data the run was trained on. A relative path is tried from the current
             folder, then from the run's folder and every folder above it.
+        data: where the data is now, if the run moved: the data itself, or a folder above it in which the last names of
+            the configured path are looked for.
 
     Raises:
         SceneError: if ``path`` is not a run, has no complete checkpoint, or its data is needed and not found.
@@ -146,11 +148,10 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
     dataparser = dataparser if isinstance(dataparser, Tagged) else Tagged("", {})
     checkpoint, step = _checkpoint(folder, root.fields.get("relative_model_dir"), chosen)
     candidates = (datamanager.fields.get("data"), dataparser.fields.get("data"), root.fields.get("data"))
-    data = next((Path(value) for value in candidates if isinstance(value, (str, Path)) and str(value) != "."), None)
-    if data is None:
-        if need_data:
-            raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
-        data = Path()
+    named = next((Path(value) for value in candidates if isinstance(value, (str, Path)) and str(value) != "."), Path())
+    found = named
+    if need_data:
+        found = _find_data(named, folder, config_path) if data is None else _moved_data(named, Path(data), config_path)
     transform, scale = read_transforms(folder / RUN_FILES.transforms)
     planned = root.fields.get("max_num_iterations")
     return Run(
@@ -162,7 +163,7 @@ def open_run(path: Path | str, need_data: bool = True) -> Run:
         method_name=str(root.fields.get("method_name") or ""),
         experiment_name=str(root.fields.get("experiment_name") or ""),
         timestamp=str(root.fields.get("timestamp") or ""),
-        data=_find_data(data, folder, config_path) if need_data else data,
+        data=found,
         dataparser_class=dataparser.tag,
         dataparser_fields=_settings(dataparser, "data"),
         datamanager_fields=_settings(datamanager, "data", "dataparser"),
@@ -230,8 +231,20 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
     )
 
 
+def _moved_data(named: Path, place: Path, config_path: Path) -> Path:
+    """The data of a run at or below a folder: by the last names of its configured path, as many as possible."""
+    names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
+    for candidate in (*(place.joinpath(*names[first:]) for first in range(len(names))), place):
+        with suppress(OSError):  # a name that is too long, a folder that may not be looked into
+            if candidate.exists():
+                return candidate
+    raise SceneError(f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a folder above")
+
+
 def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
     """The configured data's path on this machine."""
+    if data == Path():
+        raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
     with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
         data = data.expanduser()
     if data.is_absolute():
@@ -246,7 +259,7 @@ def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
     places = ", ".join(map(str, tried[:3])) + (f" and {len(tried) - 3} more above" if len(tried) > 3 else "")
     raise SceneError(
         f"{config_path}: its data {data} is not there; tried {places}; "
-        "start from the folder where the run was trained, or put the data back"
+        "name the folder where it is now (--data DIR), or put the data back"
     )
 
 

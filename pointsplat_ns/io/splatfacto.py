@@ -186,7 +186,7 @@ class PhotoFit:
     """(C, 6) float32: of each training photo's pose a translation in scene units, then a rotation vector in radians;
     None if poses were not corrected."""
     colors: str
-    """Key of the parameters that change the colours of each photo, such as a bilateral grid; empty if there are none."""
+    """Key of parameters that change the colours of each photo, such as a bilateral grid; empty if there are none."""
 
 
 def read_photo_fit(path: Path | str) -> PhotoFit:

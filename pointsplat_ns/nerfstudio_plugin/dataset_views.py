@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
-from pointsplat_ns.errors import DataError, MissingPackageError, need
+from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.io.runs import open_run, scene_name
+from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
 
-def dataset_views(path: Path | str, split: Split = "train") -> Views:
+def dataset_views(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Views:
     """The poses of a Splatfacto run's dataset, in the frame and at the resolution that it was trained in; those of
     training photos as the training corrected them.
 
@@ -34,6 +34,7 @@ def dataset_views(path: Path | str, split: Split = "train") -> Views:
     Args:
         path: the run's folder, ``config.yml`` or checkpoint.
         split: "train" for the poses of the training photos, "test" for those of the held-out photos.
+        data: where the run's data is now, if it moved: the data itself, or a folder above it.
 
     Returns:
         C views on the CPU, with the background colour that the run is evaluated with.
@@ -50,19 +51,21 @@ def dataset_views(path: Path | str, split: Split = "train") -> Views:
         pointsplat_ns.errors.SceneError: outputs/kitchen/splatfacto/2026-01-01_120000: no such file or folder; \
 expected a nerfstudio run
     """
-    return _views_of(*_open(path, split), split)
+    return _views_of(*_open(path, split, data), split)
 
 
-def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, list[Tensor]]:
+def dataset_photos(
+    path: Path | str, split: Split, count: int, data: Path | str | None = None
+) -> tuple[Views, list[Tensor]]:
     """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and the views on the CPU that
     they show once undistorted. Arguments and errors are those of :func:`dataset_views`; a photo that cannot be used is
     a DataError."""
-    scene, frames = _open(path, split)
+    scene, frames = _open(path, split, data)
     if split == "train":
         _need_as_rendered(scene)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]
-    photos = [in_unit_range(data["image"][..., :3]).float() for _, data in shown]
+    photos = [in_unit_range(content["image"][..., :3]).float() for _, content in shown]
     height, width = photos[0].shape[:2]
     if any(photo.shape[:2] != (height, width) for photo in photos):
         raise DataError(f"{scene.run.data}: photos of the {split} split have several sizes; expected one")
@@ -76,19 +79,30 @@ def dataset_photos(path: Path | str, split: Split, count: int) -> tuple[Views, l
     return views, photos
 
 
-def has_masks(path: Path | str, split: Split) -> bool:
+def has_masks(path: Path | str, split: Split, data: Path | str | None = None) -> bool:
     """Whether photos of a split have masks. Arguments and errors are those of :func:`dataset_views`."""
-    _, frames = _open(path, split)
+    _, frames = _open(path, split, data)
     return any(frames.dataset._dataparser_outputs.mask_filenames or ())
 
 
-def training_photos(path: Path | str) -> Photos:
+def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, "train", cached=True)
+    scene, frames = _open(path, "train", data, cached=True)
     _need_as_rendered(scene)
     _views_of(scene, frames, "train")
     return TrainingPhotos(scene, frames)
+
+
+def need_named_data(scene: object, data: Path | str | None) -> None:
+    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no path of a run, or the
+    poses cannot be read there. Where nothing is named, data that is missing is no error."""
+    if data is None:
+        return
+    if not isinstance(scene, (str, Path)) or not may_be_run(scene):
+        what = scene if isinstance(scene, (str, Path)) else "a scene in memory"
+        raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
+    dataset_views(scene, data=data)
 
 
 class TrainingPhotos(Sequence[Example]):
@@ -108,9 +122,9 @@ class TrainingPhotos(Sequence[Example]):
         return Example(view, data["image"][..., :3], data.get("mask"))
 
 
-def _open(path: Path | str, split: Split, cached: bool = False) -> tuple[TrainedScene, Frames]:
+def _open(path: Path | str, split: Split, data: Path | str | None, cached: bool = False) -> tuple[TrainedScene, Frames]:
     """The scene of a run, and the frames of a split, which stay in memory as far as there is room if ``cached``."""
-    run = open_run(path)  # before nerfstudio is imported, which takes seconds
+    run = open_run(path, data=data)  # before nerfstudio is imported, which takes seconds
     try:
         need("nerfstudio", "reading the photos and poses of a run")
     except MissingPackageError as error:

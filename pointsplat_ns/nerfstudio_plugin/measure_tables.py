@@ -42,6 +42,7 @@ def measure_tables(
     scoring_views: int = 40,
     fine_tune: int = 300,
     splat_transform: str | None = None,
+    data: str | Path | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[Group]:
@@ -65,6 +66,8 @@ def measure_tables(
         scoring_views: largest number of training poses that LightGaussian and PUP-3DGS score from.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
         splat_transform: the program; by default the one on PATH, if any.
+        data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
+            data is not found is measured without photos, which is logged.
         force: start over.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
 
@@ -97,7 +100,7 @@ def measure_tables(
         raise PointSplatError(f"keeps are {', '.join(f'{share:g}' for share in shares)}; expected shares such as 0.1")
     if not scenes:
         raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
-    opened = [_table_scene(Path(path)) for path in scenes]
+    opened = [_table_scene(Path(path), data) for path in scenes]
     opened = _grouped(opened, groups)
     journals = [folder / scene.name / TABLE_FILES.cells for scene in opened]
     check_journal_folder(folder, f"*/{TABLE_FILES.cells}", TABLE_FILES.results, force, journals)
@@ -129,41 +132,44 @@ def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableS
     return [dataclasses.replace(scene, group=wanted.get(scene.name)) for scene in scenes]
 
 
-def _table_scene(path: Path) -> TableScene:
+def _table_scene(path: Path, data: str | Path | None) -> TableScene:
     """A scene, of which nothing is read but the hash of its file and, of a run, its settings."""
-    dataset = _dataset(path) if may_be_run(path) else ""
-    return TableScene(name_of(path), path, source_file(path).sha256, dataset, None, functools.partial(_open, path))
+    dataset = _dataset(path, data) if may_be_run(path) else ""
+    opened = functools.partial(_open, path, data)
+    return TableScene(name_of(path), path, source_file(path).sha256, dataset, None, opened)
 
 
-def _dataset(path: Path) -> str:
+def _dataset(path: Path, data: str | Path | None) -> str:
     """The paper's dataset that a run belongs to; empty if none, or its data is gone."""
     try:
-        return paper_dataset(open_run(path))
+        return paper_dataset(open_run(path, data=data))
     except SceneError:
         return ""
 
 
-def _open(path: Path, options: TableOptions) -> OpenedScene:
+def _open(path: Path, data: str | Path | None, options: TableOptions) -> OpenedScene:
     """Read a scene, its views, and its photos if there are any."""
     dense = read_scene(path)
 
     def new_views() -> ViewSource:
-        return ViewSource(dense, run=path, dataset_views=dataset_views)
+        return ViewSource(dense, run=path, dataset_views=functools.partial(dataset_views, data=data))
 
-    held_out, training = _looked_at(path, options) or _sampled(new_views(), options)
+    held_out, training = _looked_at(path, data, options) or _sampled(new_views(), options)
     judged = held_out.resized(options.side)
-    differs = _differences(path, dense, held_out, judged)
+    differs = _differences(path, data, dense, held_out, judged)
     return OpenedScene(dense, judged, training.resized(options.side), new_views, differs)
 
 
-def _differences(path: Path, dense: Gaussians, held_out: JudgedViews, judged: JudgedViews) -> tuple[str, ...]:
+def _differences(
+    path: Path, data: str | Path | None, dense: Gaussians, held_out: JudgedViews, judged: JudgedViews
+) -> tuple[str, ...]:
     """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000 Splatfacto steps, judged by
     all held-out photos in their full size. ``held_out`` are the views before they are resized to the ``judged`` ones.
     """
     if held_out.photos is None:
         return ("no held-out photos",)
-    run, found = open_run(path), []
-    everything = len(dataset_views(path, "test"))
+    run, found = open_run(path, data=data), []
+    everything = len(dataset_views(path, "test", data))
     if len(held_out.views) < everything:
         found.append(f"{len(held_out.views)} of {everything} held-out photos")
     scale = run.datamanager_fields.get("camera_res_scale_factor", 1.0)
@@ -176,18 +182,19 @@ def _differences(path: Path, dense: Gaussians, held_out: JudgedViews, judged: Ju
         found.append(f"SH degree {dense.sh_degree}")
     if run.step + 1 < PROTOCOL.dense_steps:
         found.append(f"{run.step + 1:,} of {PROTOCOL.dense_steps:,} Splatfacto steps")
-    if has_masks(path, "test"):
+    if has_masks(path, "test", data):
         found.append("masks are not applied")
     return tuple(found)
 
 
-def _looked_at(path: Path, options: TableOptions) -> tuple[JudgedViews, JudgedViews] | None:
+def _looked_at(path: Path, data: str | Path | None, options: TableOptions) -> tuple[JudgedViews, JudgedViews] | None:
     """Held-out photos, and photos to train on; None if there are none."""
     if not may_be_run(path):
         return None
     try:
-        held_out = JudgedViews(*dataset_photos(path, "test", options.views), "held-out photos")
-        return held_out, JudgedViews(*dataset_photos(path, "train", options.training_views), "training photos")
+        held_out = JudgedViews(*dataset_photos(path, "test", options.views, data), "held-out photos")
+        training = dataset_photos(path, "train", options.training_views, data)
+        return held_out, JudgedViews(*training, "training photos")
     except (SceneError, DataError) as error:
         logger.warning("%s: no photos to compare with: %s", path, error)
         return None

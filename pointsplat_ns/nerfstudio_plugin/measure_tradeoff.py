@@ -18,7 +18,12 @@ from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, training_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import (
+    dataset_photos,
+    dataset_views,
+    need_named_data,
+    training_photos,
+)
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.journal import check_journal_folder
@@ -43,6 +48,7 @@ def measure_tradeoff(
     poses: str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
+    data: str | Path | None = None,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -70,6 +76,7 @@ def measure_tradeoff(
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
             :func:`pointsplat_ns.compact` compares in, of 784 x 441 pixels for 1920 x 1080; photos are reduced to them.
         up: as for :func:`pointsplat_ns.prune`.
+        data: as for :func:`pointsplat_ns.prune`.
         target_db: least PSNR against the dense scene's renders, over the pixels that it covers, dB.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
@@ -101,6 +108,7 @@ def measure_tradeoff(
     targets = targets_of(target_db, target_ms, target_mb, photos=on_photos)
     size, upward = parse_resolution(resolution), up_named(up)
     path, folder = Path(scene), Path(folder)
+    need_named_data(path, data)
     with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
         dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
         results = SWEEP_FILES.every
@@ -111,9 +119,9 @@ def measure_tradeoff(
             force,
             [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
         )
-        subject = subject_of(dense, path, given, resolution=size, up=upward)
+        subject = subject_of(dense, path, given, resolution=size, up=upward, data=data)
         file = None if poses is None else Path(poses)
-        training = training_photos(path) if on_photos else None
+        training = training_photos(path, data) if on_photos else None
         subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file, training=training)
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
@@ -143,6 +151,7 @@ def subject_of(
     suffix: str = ".ply",
     resolution: tuple[int, int] | None = None,
     up: Up | None = None,
+    data: str | Path | None = None,
 ) -> Subject:
     """A scene to be measured, with the views that its commands have and its held-out photos.
 
@@ -153,15 +162,19 @@ def subject_of(
         refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
         suffix: of the format that smaller scenes are written in.
         resolution, up: as for :class:`~pointsplat_ns.looking.view_source.ViewSource`.
+        data: where the data of the run is now, if it moved.
     """
+    read = functools.partial(dataset_views, data=data)
     has_photos = path is not None and views is None and may_be_run(path)
     return Subject(
         dense=dense,
         path=path or Path("scene.ply"),
         name="scene",
         sha256="",
-        new_views=lambda: ViewSource(dense, views, path, dataset_views, resolution, up=up),
-        held_out=functools.partial(dataset_photos, path, "test") if path is not None and has_photos else None,
+        new_views=lambda: ViewSource(dense, views, path, read, resolution, up=up),
+        held_out=functools.partial(dataset_photos, path, "test", data=data)
+        if path is not None and has_photos
+        else None,
         refiner=refiner,
         suffix=suffix,
         resolution=resolution,

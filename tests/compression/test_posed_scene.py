@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, cloud, run_of
+from pointsplat_ns.cli import main
 from pointsplat_ns.compression.placing import run_frame
 from pointsplat_ns.compression.posed_scene import check_views_show, read_posed
 from pointsplat_ns.errors import PointSplatError, SceneError
@@ -149,6 +151,20 @@ def test_the_frame_of_a_run_is_undone(tmp_path):
     expected = 0.125 * (data.means.double() @ transform[:, :3].double().T + transform[:, 3].double())
     assert torch.allclose(scene.means.double(), expected, atol=1e-5)
     assert torch.allclose(run_frame(run).inverse().apply(scene).means, data.means, atol=1e-5)
+
+
+def test_the_frame_of_a_run_without_its_transforms_is_asked_for(trained_walls, tmp_path):
+    run = shutil.copytree(run_of(trained_walls, "wall-a"), tmp_path / "run")
+    ps.place(ps.load(run), original_frame=run)
+    (run / "dataparser_transforms.json").unlink()
+    for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
+        with pytest.raises(
+            SceneError, match=r"run/dataparser_transforms.json: no such file.*copy it from the original"
+        ):
+            ps.place(ps.load(run), original_frame=named)
+    with pytest.raises(SystemExit):
+        main(["convert", str(run), str(tmp_path / "a.ply"), "--original-frame"])
+    assert not (tmp_path / "a.ply").exists()
 
 
 def test_a_transform_that_is_no_similarity_is_refused(tmp_path):

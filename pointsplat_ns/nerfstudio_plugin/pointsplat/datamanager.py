@@ -32,6 +32,9 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: ScenesDataManager)
     data: Path | None = None
     """A trained Splatfacto run, a 3DGS .ply, or a folder above several (the newest run of each experiment is taken)."""
+    scene_data: Path | None = None
+    """Where the photos of the runs are now, if they moved: a folder above those of all runs, or those of the only one.
+    A run whose photos are not found is left out, and named."""
     supervision: Supervision = "auto"
     """Training targets for renders of the refined scene. photos: the photos of trained runs. dense: renders of the
     dense scene from the dataset's poses, or without a dataset from poses sampled in free space. auto: photos for
@@ -100,7 +103,13 @@ class ScenesDataManager(SpiralSource):
         held_out_poses = max(1, config.sampled_poses // 5)
         poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
         self.supervision, self.scenes = training_scenes(
-            Path(config.data), config.supervision, self.cache, poses, device, need_data=test_mode != "inference"
+            Path(config.data),
+            config.supervision,
+            self.cache,
+            poses,
+            device,
+            need_data=test_mode != "inference",
+            data=config.scene_data,
         )
         names = [scene.name for scene in self.scenes]
         unknown = [name for name in config.eval_scenes if name not in names]

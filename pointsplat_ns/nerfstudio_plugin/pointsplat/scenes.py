@@ -16,13 +16,14 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import Run, open_run
+from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.nerfstudio_plugin.corrected_poses import corrected_poses, need_photos_as_rendered
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
@@ -122,7 +123,10 @@ class TrainedScene(DenseScene):
                 f"{self.run.data}: cannot be read as the data of {self.run.folder} ({why}); put back the data as it was"
             ) from error
         moved = (outputs.dataparser_transform[:3] - self.run.transform).abs().max()
+        kept = self.run.folder / RUN_FILES.transforms
         if moved > 1e-4 or abs(outputs.dataparser_scale / self.run.scale - 1) > 1e-4:
+            if not kept.is_file():
+                raise DataError(f"{kept}: no such file, so the frame of the scene is not known; put back the file")
             raise DataError(
                 f"{self.run.data}: its poses are no longer in the frame that {self.run.folder} was trained in (the "
                 f"transform differs by {float(moved):.3g}, the scale is {outputs.dataparser_scale:.6g} and was "
@@ -163,18 +167,21 @@ def training_scenes(
     poses: SampledPoses | None = None,
     device: torch.device | str = "cpu",
     need_data: bool = True,
+    data: Path | None = None,
 ) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
     """The scenes that ``--data`` names, and the kind of their training targets.
 
     Args:
         folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes the runs, whose data must be found; ``dense`` takes the runs, with or without
-            their data, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
+        supervision: ``photos`` takes the runs whose data is found, and names the others; ``dense`` takes the runs, with
+            or without their data, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
         cache, poses, device: passed to the scenes.
         need_data: whether photos will be needed.
+        data: where the data of the runs is now, as for :func:`~pointsplat_ns.io.runs.open_run`.
 
     Raises:
-        SceneError: if there is no scene, or a run's data is needed and not found.
+        SceneError: if there is no scene, or photos are needed and those of no run are found.
+        DataError: if photos are needed whose colours a training fitted to each.
     """
     runs, plys, nothing = find_runs_and_plys(folder, supervision)
     if not runs and not plys:
@@ -187,17 +194,27 @@ def training_scenes(
         raise SceneError(f"{nothing}{hint if supervision == 'photos' else ', or 3DGS PLY files'}") from nothing
     chosen: Literal["photos", "dense"] = "dense" if plys or supervision == "dense" else "photos"
     scenes: list[DenseScene] = []
+    missing: list[str] = []
     for name, run in runs.items():
         has_photos = True
         if need_data:
             try:
-                run = dataclasses.replace(run, data=open_run(run.config_path).data)
-            except SceneError as error:
-                if chosen == "photos":
-                    raise SceneError(f"{error}, or take --pipeline.datamanager.supervision dense") from error
+                run = dataclasses.replace(run, data=open_run(run.config_path, data=data).data)
+            except SceneError:
                 has_photos = False
+                missing.append(f"{run.config_path}: its data {run.data} is not there")
+                what = "left out" if chosen == "photos" else "seen from sampled poses"
+                CONSOLE.log(f"{name} is {what}: {missing[-1]}")
             if chosen == "photos":
+                if not has_photos:
+                    continue
                 need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
         scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
     scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
+    if not scenes:
+        others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""
+        raise SceneError(
+            f"{missing[0]}{others}; name the folder where it is now (--pipeline.datamanager.scene-data DIR), or take "
+            "--pipeline.datamanager.supervision dense"
+        )
     return chosen, scenes
