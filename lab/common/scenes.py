@@ -15,14 +15,14 @@ from pointsplat_ns.io import open_run, read_scene, scene_name
 TUNING = (
     *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
     *("pc_statue_angel", "pc_statue_narcissus", "pc_statue_trumpet", "kitchen", "fox", "final_3dgs", "vr_project"),
-    *("room", "room5"),
+    *("room", "room5", "meeting", "drone_hall", "figure", "ray"),
 )
 """Scenes that constants may be chosen on."""
 
 JUDGED = (
     *("apt_kitchen_balcony", "cake_fraisier", "mujoco_tabletop", "pc_playbot", "rock", "pc_statue_angel_kneeling"),
     *("pc_statue_angel_with_candlestick", "pc_statue_st_peter", "lounge", "diorama", "ethiopianHead", "dataset_perso"),
-    *("lego_dense", "taebak"),
+    *("lego_dense", "taebak", "office", "room35", "chair", "plant", "phone", "can"),
 )
 """Scenes that no constant is chosen on: they were named before the first measurement. See docs/benchmarks.md."""
 

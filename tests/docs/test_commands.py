@@ -15,6 +15,7 @@ from torch.distributed.run import get_args_parser as torchrun_parser
 
 import pointsplat_ns as ps
 from documented import BLOCKS, COMMANDS, NS_PROGRAMS, PAGES, ROOT, check_arguments, help_of, inline_code, start
+from lab.judge.captures import CAPTURES
 from pointsplat_ns.cli.help import EXAMPLES
 
 OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-print-completion"}
@@ -111,6 +112,12 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         if words != ("docker", "build", "-t", "pointsplat", "."):
             assert words[1] == "run"
             check_arguments(words[words.index("pointsplat") :], monkeypatch, capsys)
+    elif program == "git":
+        if words[1] == "clone":
+            assert words[2].removeprefix("https://github.com/") in {known.repository for known in CAPTURES.values()}
+        else:
+            assert words[1:4] == ("-C", "clone", "checkout")
+            assert any(known.commit.startswith(words[4]) for known in CAPTURES.values())
     elif program == "npm":
         assert words == ("npm", "install", "@playcanvas/splat-transform")
     else:
