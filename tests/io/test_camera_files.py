@@ -74,6 +74,76 @@ def test_cameras_are_those_that_were_written(kind, tmp_path):
     need_same(read_views(path), views)
 
 
+@pytest.mark.parametrize(
+    ("model", "named"),
+    [
+        ("sparse/0", "."), ("sparse/0", "sparse"), ("sparse", "."), ("colmap/sparse/0", "."),
+        ("colmap/sparse/0", "colmap"), ("0", "."), ("sparse/0", "sparse/0/images.bin"),
+    ],
+)  # fmt: skip
+def test_the_model_of_a_colmap_project_is_found_below_its_root(model, named, tmp_path):
+    views = some_views()
+    write_colmap_binary(views, tmp_path / model)
+    (tmp_path / "images").mkdir()
+    assert is_camera_file(tmp_path / named)
+    need_same(read_views(tmp_path / named), views)
+
+
+def test_one_of_several_models_of_colmap_is_read_and_the_others_are_named(tmp_path, caplog):
+    views = some_views(5)
+    for number, part in enumerate((views, views[:2], views[:1])):
+        write_colmap_text(part, tmp_path / "sparse" / str(number))
+    need_same(read_views(tmp_path), views)
+    assert "one of several models; not read: 1, 2" in caplog.text
+
+
+def test_poses_of_ns_export_are_in_the_frame_of_the_scene_and_lack_intrinsics(tmp_path, caplog):
+    views = some_views()
+    poses = viewmats_to_opengl(views.viewmats.double()).tolist()
+    entries = [{"file_path": f"/photos/{name_of(i)}", "transform": pose} for i, pose in enumerate(poses)]
+    (tmp_path / "dataparser_transforms.json").write_text(moved_as(TURN, 0.5))
+    found = read_views(written(entries, tmp_path / "transforms_train.json"))
+    torch.testing.assert_close(found.viewmats, views.viewmats.double(), rtol=0, atol=1e-9)
+    assert (found.width, found.height) == (1920, 1080)
+    angle = 2 * math.degrees(math.atan(0.5 * 1920 / float(found.Ks[0, 0, 0])))
+    assert angle == pytest.approx(60) and found.Ks[0, 0, 0] == found.Ks[0, 1, 1]
+    assert (
+        "without intrinsics; taken for 1920 x 1080 pixels and a horizontal field of view of 60 degrees" in caplog.text
+    )
+
+
+def test_poses_that_nerfstudio_exports_are_those_of_its_cameras(tmp_path):
+    """As nerfstudio's own exporter writes them."""
+    utils = pytest.importorskip("nerfstudio.exporter.exporter_utils")
+    from types import SimpleNamespace
+
+    from nerfstudio.cameras.cameras import Cameras
+
+    poses = viewmats_to_opengl(some_views(4).viewmats.double()).float()
+    names = [Path("images", name_of(index)) for index in range(4)]
+    dataset = SimpleNamespace(cameras=Cameras(poses, 50.0, 50.0, 32.0, 24.0, 64, 48), image_filenames=names)
+    entries = utils.collect_camera_poses_for_dataset(dataset)
+    found = read_views(written(entries, tmp_path / "transforms_eval.json"))
+    torch.testing.assert_close(viewmats_to_opengl(found.viewmats).float(), poses, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ([{"transform": [[1.0] * 4] * 2}], "camera 0 has no pose; expected 'transform'"),
+        ([{"transform": IDENTITY}, 7], "camera 1 has no pose"),
+        ([{"transform": [[2.0] * 4] * 3}], "camera 0 is no rigid motion"),
+        ([{"transform": [[math.nan] * 4] * 3}], "camera 0 is no rigid motion"),
+        ([{"transform": None}], "camera 0 has no pose"),
+    ],
+)
+def test_damaged_poses_of_ns_export_are_refused_in_one_line(entries, said, tmp_path):
+    path = written(entries, tmp_path / "transforms_train.json")
+    with pytest.raises(ps.DataError, match=said) as caught:
+        read_views(path)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
+
+
 def test_a_camera_of_3dgs_looks_along_its_third_column(tmp_path):
     entry = {
         "id": 0, "img_name": "a", "width": 60, "height": 40, "fx": 30.0, "fy": 30.0,
@@ -335,7 +405,9 @@ def test_points_take_no_memory(tmp_path):
 def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="no such file; expected cameras.json of 3DGS, transforms.json"):
         read_views(tmp_path / "nothing.json")
-    with pytest.raises(ps.DataError, match="a folder without cameras.bin or cameras.txt; expected"):
+    with pytest.raises(
+        ps.DataError, match="a folder without cameras.bin or cameras.txt, there or in sparse/0; expected"
+    ):
         read_views(tmp_path)
     folder = write_colmap_binary(some_views(2), tmp_path / "sparse")
     (folder / "cameras.bin").unlink()

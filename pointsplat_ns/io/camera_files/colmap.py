@@ -53,17 +53,26 @@ class _Image(NamedTuple):
     camera: int
 
 
-def is_model(path: Path) -> bool:
-    """Whether a path is a COLMAP model: its folder, or one of the two files in it."""
-    folder = path if path.is_dir() else path.parent
-    files = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-    return (path.is_dir() or path.name in files) and any((folder / name).is_file() for name in files)
+_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
+_BELOW = ("", "0", "sparse/0", "sparse", "colmap/sparse/0")
+"""Where a model lies below a folder: the model's own, that of all models, or that of a project."""
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder of a COLMAP model: of one of the two files in it, its own, that of all models (``sparse``), or that of
+    a project, with ``sparse/0`` or ``colmap/sparse/0`` in it. None if there is no model."""
+    if not path.is_dir():
+        return path.parent if path.name in _FILES and path.is_file() else None
+    folders = (path / below for below in _BELOW)
+    return next((folder for folder in folders if any((folder / name).is_file() for name in _FILES)), None)
 
 
 def colmap_cameras(path: Path) -> CameraFile:
-    """The cameras of a COLMAP model; ``path`` is its folder, or one of the files in it. Raises DataError if a file is
+    """The cameras of a COLMAP model, ``path`` as for :func:`model_folder`. Raises DataError if there is none, a file is
     missing or damaged, or an image has no usable pose or camera."""
-    folder = path if path.is_dir() else path.parent
+    folder = model_folder(path) or path
+    if folder.name == "0" and (others := [place.name for place in folder.parent.glob("[1-9]*") if model_folder(place)]):
+        logger.warning("%s: one of several models; not read: %s", folder, ", ".join(sorted(others)[:4]))
     kind = next((kind for kind in ("bin", "txt") if (folder / f"images.{kind}").is_file()), "bin")
     cameras_path, images_path = folder / f"cameras.{kind}", folder / f"images.{kind}"
     for needed in (cameras_path, images_path):

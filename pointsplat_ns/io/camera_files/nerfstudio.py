@@ -4,6 +4,9 @@
 ``cx``, ``cy``, ``w``, ``h`` and the distortion stand in each frame or once for all; NeRF-synthetic has only
 ``camera_angle_x``, the horizontal field of view in radians. ``applied_transform`` (3 x 4) and ``applied_scale`` say how
 the world of the original photos was moved before the file was saved.
+
+``ns-export cameras`` writes another file, ``transforms_train.json``: a list of ``file_path`` and ``transform`` (3 x 4,
+the same axes) without intrinsics. Its poses are those of the training, corrected ones too, in the scene's frame.
 """
 
 from __future__ import annotations
@@ -43,6 +46,44 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     return CameraFile(found, _saved_motion(content, path))
 
 
+EXPORTED = (1920, 1080, 60.0)
+"""Width and height, pixels, and horizontal field of view, degrees, of cameras without intrinsics."""
+
+
+def exported_cameras(content: list[Any], path: Path) -> CameraFile:
+    """The cameras in the JSON of ``ns-export cameras``, which has no intrinsics: :data:`EXPORTED` is taken, with a
+    warning. Raises DataError if an entry is no camera."""
+    need_count(path, len(content))
+    width, height, angle = EXPORTED
+    focal = 0.5 * width / math.tan(0.5 * math.radians(angle))
+    found = []
+    for index, entry in enumerate(content):
+        entry = entry if isinstance(entry, dict) else {}
+        pose = _pose(entry.get("transform"))
+        if pose is None:
+            raise DataError(f"{path}: camera {index} has no pose; expected 'transform', 3 x 4 numbers")
+        name = entry.get("file_path")
+        found.append(
+            Camera(
+                name if isinstance(name, str) else "", pose, (width, height), (focal, focal), (width / 2, height / 2)
+            )
+        )
+    logger.warning(
+        "%s: poses without intrinsics; taken for %d x %d pixels and a horizontal field of view of %g degrees",
+        path, width, height, angle,
+    )  # fmt: skip
+    return CameraFile(found)
+
+
+def _pose(rows: Any) -> list[float] | None:
+    """The 16 numbers of a pose of OpenGL's axes in OpenCV's; None if it is none."""
+    numbers = matrix(rows, (3, 4), 4)
+    if numbers is None:
+        return None
+    pose = [number for x, y, z, w in numbers for number in (x, -y, -z, w)]
+    return pose if len(numbers) == 4 else [*pose, 0.0, 0.0, 0.0, 1.0]
+
+
 def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path, size: Any) -> Camera:
     kind = said["camera_model"]
     lenses = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FISHEYE")
@@ -56,14 +97,13 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path,
     if fx is None or fy is None:
         raise DataError(f"{path}: camera {index} has no focal length; expected a number 'fl_x' or 'camera_angle_x'")
     cx, cy = finite(said["cx"]), finite(said["cy"])
-    rows = matrix(frame.get("transform_matrix"), (3, 4), 4)
-    if rows is None:
+    pose = _pose(frame.get("transform_matrix"))
+    if pose is None:
         raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
-    pose = [number for x, y, z, w in rows for number in (x, -y, -z, w)]  # OpenGL's axes to OpenCV's
     name = frame.get("file_path")
     return Camera(
         name if isinstance(name, str) else "",
-        pose if len(rows) == 4 else [*pose, 0.0, 0.0, 0.0, 1.0],
+        pose,
         (width, height),
         (fx, fy),
         (0.5 * width if cx is None else cx, 0.5 * height if cy is None else cy),

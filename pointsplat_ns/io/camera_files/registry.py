@@ -7,22 +7,27 @@ from pathlib import Path
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, rigid
-from pointsplat_ns.io.camera_files.colmap import colmap_cameras, is_model
+from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
 from pointsplat_ns.io.camera_files.inria import inria_cameras
-from pointsplat_ns.io.camera_files.nerfstudio import nerfstudio_cameras
+from pointsplat_ns.io.camera_files.nerfstudio import exported_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.io.runs import RUN_FILES, read_transforms
 from pointsplat_ns.views import Views
 
-CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model"
+CAMERA_KINDS = (
+    "cameras.json of 3DGS, transforms.json of nerfstudio, transforms_train.json of ns-export cameras, or the folder of "
+    "a COLMAP model or project"
+)
 
 
 def is_camera_file(path: Path | str) -> bool:
     """Whether a path is no run and no scene, so that it can only hold cameras. The content of a file is not read."""
     path = Path(path)
     if path.is_dir():
-        return is_model(path) or not any((path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META))
+        return model_folder(path) is not None or not any(
+            (path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META)
+        )
     return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
 
 
@@ -40,10 +45,11 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
     see the same field of view, by other focal lengths.
 
     Args:
-        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, or the folder of a COLMAP model.
-        transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of the last two
-            into the frame of the scene. By default the one beside ``path``, if there is one. Poses of ``cameras.json``
-            are in the scene's frame already.
+        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, the ``transforms_train.json`` of ``ns-export
+            cameras``, or the folder of a COLMAP model or project.
+        transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of
+            ``transforms.json`` and of COLMAP into the frame of the scene. By default the one beside ``path``, if there
+            is one. Poses of the others are in the scene's frame already.
 
     Returns:
         C views, float64 on the CPU, over black, in the order of the names of their photos.
@@ -64,7 +70,7 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
         (1, 64, 48)
     """
     path = Path(path)
-    found = colmap_cameras(path) if is_model(path) else _json_cameras(path)
+    found = colmap_cameras(path) if model_folder(path) else _json_cameras(path)
     transforms = transforms or transforms_beside(path)
     if found.saved is None or transforms is None:
         return checked_views(path, found.cameras)
@@ -75,9 +81,11 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
 
 
 def _json_cameras(path: Path) -> CameraFile:
-    """The cameras of a JSON file: a list is INRIA's, an object with frames nerfstudio's."""
+    """The cameras of a JSON file: a list is INRIA's or of ns-export, an object with frames nerfstudio's."""
     if path.is_dir():
-        raise DataError(f"{path}: a folder without cameras.bin or cameras.txt; expected {CAMERA_KINDS}")
+        raise DataError(
+            f"{path}: a folder without cameras.bin or cameras.txt, there or in sparse/0; expected {CAMERA_KINDS}"
+        )
     path = require_file(path, CAMERA_KINDS)
     size = path.stat().st_size
     if size > CAMERA_LIMITS.file_bytes:
@@ -90,7 +98,8 @@ def _json_cameras(path: Path) -> CameraFile:
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}") from error
     if isinstance(content, list):
-        return inria_cameras(content, path)
+        exported = bool(content) and isinstance(content[0], dict) and "transform" in content[0]
+        return exported_cameras(content, path) if exported else inria_cameras(content, path)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)
     if isinstance(content, dict) and "camera_path" in content:
