@@ -9,10 +9,35 @@ from torch import Tensor
 
 from pointsplat_ns.io.files import replacing
 
+_ORIENTATION = 274
+"""EXIF's tag of how a photo is to be turned."""
+_TURNED = (5, 6, 7, 8)
+"""Its values that exchange width and height."""
+
 
 def in_unit_range(image: Tensor) -> Tensor:
     """An image of any shape in [0, 1]: bytes count in 255ths, floats stay."""
     return image.float() / 255 if image.dtype == torch.uint8 else image
+
+
+def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
+    """What to do with a photo of another size than its camera's, as the end of an error: about its EXIF orientation, if
+    that turns it to the shape that is wanted (width and height, pixels); else empty. Photos are read as they are
+    stored, which is how COLMAP reads them, too."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as photo:
+            size, orientation = photo.size, photo.getexif().get(_ORIENTATION)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return ""
+    upright = (size[0] - size[1]) * (wanted[0] - wanted[1]) > 0  # or scaled
+    if orientation not in _TURNED or upright:
+        return ""
+    return (
+        f"; its EXIF orientation ({orientation}) says that it is to be turned, and the camera is that of the turned "
+        "photo: turn the photos themselves, for example with mogrify -auto-orient *.jpg"
+    )
 
 
 def write_picture(picture: Tensor, path: Path) -> None:

@@ -21,6 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.pictures import exif_hint
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -54,10 +55,11 @@ class UndistortedDataset(InputDataset):
             raise DataError(f"{path}: cannot be read as the photo of frame {image_idx}: {error}") from error
         camera = self.lens_cameras[image_idx : image_idx + 1]
         height, width = data["image"].shape[:2]
-        if (width, height) != (int(camera.width), int(camera.height)):
+        wanted = (int(camera.width), int(camera.height))
+        if (width, height) != wanted:
             raise DataError(
-                f"{path}: {width} x {height} pixels, but its camera says {int(camera.width)} x {int(camera.height)}; "
-                "give the camera the size of the photos"
+                f"{path}: {width} x {height} pixels, but its camera says {wanted[0]} x {wanted[1]}"
+                + (exif_hint(path, wanted) or "; give the camera the size of the photos")
             )
         if _has_lens(camera)[0]:
             _, image, mask = _undistorted(camera, path, data["image"].numpy(), data)

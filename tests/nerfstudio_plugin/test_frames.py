@@ -173,6 +173,21 @@ def test_8_bit_photos_are_read_and_those_that_nerfstudio_would_misread_are_refus
         assert Frames(dataset)[2][1]["image"].shape == (HEIGHT, WIDTH, 4 if mode == "RGBA" else 3)
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation, scale):
+    """The camera is that of the turned photo; the pixels are stored as the sensor had them."""
+    dataset = make_dataset(tmp_path, scale=scale)
+    dataset.cameras.rescale_output_resolution(scale)
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", (HEIGHT, WIDTH)).save(dataset.image_filenames[2], exif=exif)
+    with pytest.raises(DataError, match="photo2.png: .* pixels, but its camera says") as caught:
+        Frames(dataset)[2]
+    said = f"its EXIF orientation ({orientation}) says that it is to be turned" in str(caught.value)
+    assert said == ("mogrify -auto-orient" in str(caught.value)) == (orientation in (6, 8))
+
+
 @pytest.mark.parametrize(("name", "value"), [("camera_to_worlds", float("nan")), ("cy", float("inf"))])
 def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
     outputs = make_dataset(tmp_path)._dataparser_outputs

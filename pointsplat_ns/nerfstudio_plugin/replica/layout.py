@@ -22,6 +22,7 @@ import numpy as np
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import read_text
+from pointsplat_ns.io.pictures import exif_hint
 from pointsplat_ns.nerfstudio_plugin.replica.cam_params import (
     FARTHEST,
     PinholeParams,
@@ -249,6 +250,7 @@ def _check_size(path: Path, size: tuple[int, int], params: PinholeParams) -> Non
     if size != (params.width, params.height):
         raise DataError(
             f"{path}: {size[0]} x {size[1]} pixels; expected {params.width} x {params.height} as in {params.path}"
+            + exif_hint(path, (params.width, params.height))
         )
 
 
