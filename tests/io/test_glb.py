@@ -13,6 +13,7 @@ import torch
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.geometry.transforms import rotation_matrices
+from pointsplat_ns.io.formats.spz import encode_spz
 
 
 def test_holds_the_numbers_as_the_extension_names_them(tmp_path):
@@ -183,6 +184,63 @@ def test_of_several_meshes_is_one_scene(tmp_path):
 def test_that_lies_or_needs_more_is_one_error(tmp_path, changes, said):
     (tmp_path / "a.glb").write_bytes(glb_of(small_integers(), **changes))
     with pytest.raises(ps.SceneError, match=said):
+        ps.load(tmp_path / "a.glb")
+
+
+def spz_glb(data, extensions, copies=1, at=12):
+    """A ``.glb`` whose primitives hold an SPZ file in a buffer view, behind some other bytes. Its accessors have no
+    numbers: they are for programs that unpack it."""
+    accessor = {"componentType": 5126, "count": 1, "type": "VEC3"}
+    primitive = {"mode": 0, "attributes": {"POSITION": 0, "COLOR_0": 0}, "extensions": extensions}
+    content = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0, "translation": [0, 2, 0]}],
+        "meshes": [{"primitives": [primitive] * copies}],
+        "accessors": [accessor],
+        "bufferViews": [{"buffer": 0, "byteLength": at}, {"buffer": 0, "byteOffset": at, "byteLength": len(data)}],
+        "buffers": [{"byteLength": at + len(data)}],
+    }
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary = bytes(at) + data
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+INNER = [f"KHR_gaussian_splatting_compression_spz{end}" for end in ("", "_2")]
+WRAPPED = [
+    *({"KHR_gaussian_splatting": {"extensions": {name: {"bufferView": 1}}}} for name in INNER),
+    {"KHR_spz_gaussian_splats_compression": {"bufferView": 1}},
+]
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("extensions", WRAPPED, ids=["draft", "spz_2", "old"])
+def test_that_holds_spz_is_what_the_spz_holds_where_its_node_places_it(tmp_path, extensions, version):
+    data = encode_spz(cloud(40, 2, 3), version=version)
+    (tmp_path / "a.spz").write_bytes(data)
+    (tmp_path / "a.glb").write_bytes(spz_glb(data, extensions))
+    inside, found = ps.load(tmp_path / "a.spz"), ps.load(tmp_path / "a.glb")
+    torch.testing.assert_close(found.means, inside.means + torch.tensor([0.0, 2.0, 0.0]))
+    assert torch.equal(found.scales, inside.scales) and torch.allclose(found.sh, inside.sh, rtol=0, atol=1e-6)
+    assert torch.equal(found.opacities, inside.opacities) and torch.equal(found.quats, inside.quats)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [(b"no SPZ at all", "not an SPZ file"), (encode_spz(cloud(40))[:-20], "a.glb: .*"), (b"", "not an SPZ file")],
+)
+def test_whose_spz_is_damaged_is_one_error(tmp_path, data, said):
+    (tmp_path / "a.glb").write_bytes(spz_glb(data, WRAPPED[1]))
+    with pytest.raises(ps.SceneError, match=said):
+        ps.load(tmp_path / "a.glb")
+
+
+def test_whose_primitives_share_one_spz_takes_no_memory_for_each(tmp_path):
+    """10,000 times 1,000 Gaussians that are all one."""
+    scene = cloud(1)[torch.zeros(1000, dtype=torch.int64)]
+    (tmp_path / "a.glb").write_bytes(spz_glb(encode_spz(scene), WRAPPED[1], 10_000))
+    with pytest.raises(ps.SceneError, match="bytes cannot hold them"):
         ps.load(tmp_path / "a.glb")
 
 

@@ -58,8 +58,7 @@ def read_glb(path: Path | str) -> Gaussians:
     or the file is damaged."""
     path = require_file(path, "a .glb file")
     with damage_named(path, "glTF"):
-        data = load_bytes(path)
-        content, binary = _chunks(data, path)
+        content, binary = _chunks(load_bytes(path), path)
         meshes: dict[int, Gaussians] = {}
         count = 0
         for index, mesh in enumerate(content.get("meshes", [])):
@@ -69,8 +68,8 @@ def read_glb(path: Path | str) -> Gaussians:
                 for primitive in found:
                     parts.append(_primitive(primitive, content, binary, path))
                     count += len(parts[-1])
-                    if 17 * count > max(1 << 22, PACKED * len(data)):  # of primitives that share their numbers
-                        raise SceneError(f"{path}: {count} Gaussians and more; {len(data)} bytes cannot hold them")
+                    if 17 * count > max(1 << 22, PACKED * len(binary)):  # of primitives that share their numbers
+                        raise SceneError(f"{path}: {count} Gaussians and more; {len(binary)} bytes cannot hold them")
                 meshes[index] = joined(parts)
         if not meshes:
             raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
