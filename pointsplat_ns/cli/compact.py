@@ -81,7 +81,7 @@ def compact(
     after an interruption. It may also run several times at once, or on several machines that share the folder.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
+        scene: a file of any format, a checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
             rooms_compact beside rooms. Each result there has the format of its scene.
@@ -103,7 +103,7 @@ def compact(
             within the limits.
         target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model; for one scene. By default the views of its dataset, or sampled ones.
+            COLMAP project; for one scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

@@ -28,7 +28,7 @@ def info(
     files of other formats would weigh. Several, and all scenes of a folder, make a table.
 
     Args:
-        scenes: files of any format, Splatfacto checkpoints, runs (their folder or config.yml), or folders of scenes.
+        scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of scenes.
         views: a .png file for a sheet of the views that other commands use without --poses, for one scene; by default
             none.
         resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else

@@ -65,7 +65,7 @@ def prune(
     they are sampled in free space.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, a run (its folder or config.yml), or a folder of scenes.
+        scene: a file of any format, a checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
             default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run. For a folder of
             scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format of its scene.
@@ -80,7 +80,7 @@ def prune(
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
         fine_tune: number of steps of optimising the result against renders of the dense scene.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP model. They must be of this scene. By default the views of its dataset, or sampled ones.
+            COLMAP project. They must be of this scene. By default the views of its dataset, or sampled ones.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

@@ -33,7 +33,7 @@ def render(
     """Film a scene along a camera path, or two scenes from the same cameras, on any machine.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml).
+        scene: a file of any format, a checkpoint, or a run (its folder or config.yml).
         other: a second scene in the same frame, to compare with.
         output: .mp4 for a video, a folder for PNG frames, .png for the first frame alone; by default a video beside the
             scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is complete.
@@ -41,7 +41,7 @@ def render(
             they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
             (.json).
         poses: a file of cameras, by default those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
-            or the folder of a COLMAP model. A folder then gets one frame for each, unless --seconds is given.
+            or the folder of a COLMAP project. A folder then gets one frame for each, unless --seconds is given.
         split: layout of two scenes.
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
         up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default the file's own,

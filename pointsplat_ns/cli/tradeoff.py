@@ -49,7 +49,7 @@ def tradeoff(
     instead, and writes it.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml). Held-out photos
+        scene: a file of any format, a checkpoint, or a run (its folder or config.yml). Held-out photos
             of a run are used where they are found.
         output: the folder for points, pictures, tables, plots and the page; by default beside the scene: room_tradeoff
             for room.ply, tradeoff in the folder of a run.

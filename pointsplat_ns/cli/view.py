@@ -24,7 +24,7 @@ def view(
     draws; its lod-meta.json as other scenes are.
 
     Args:
-        scene: a file of any format, a Splatfacto checkpoint, or a run (its folder or config.yml); by default the page
+        scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default the page
             takes a file that is dropped on it.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z; by default the file's own, or an estimate. Write
