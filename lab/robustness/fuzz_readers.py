@@ -109,32 +109,60 @@ READERS |= {
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
     "ksplat": at("a.ksplat", _scene, inside=_ksplat),
+    "glb": at("a.glb", _scene),  # also with SPZ inside
+    "zip": at("a.zip", _scene),  # as they are
+    "zipped-ply": at("a.zip", _scene, inside=lambda data: _zip_of({"a.ply": data})),
     "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch
 }
 
 
-def _checkpoint_bytes(scene: Gaussians) -> bytes:
-    content: dict[str, object] = {"step": 1, "optimizers": {}, "schedulers": {}, "scalers": {}}
-    content["pipeline"] = {f"_model.gauss_params.{name}": value for name, value in scene.items()}
+def _saved(content: object) -> bytes:
     stream = io.BytesIO()
     torch.save(content, stream)
     return stream.getvalue()
 
 
-@reader
-def checkpoint_pickle(folder: Path) -> Read:
-    """The pickle in a checkpoint, whose numbers are as they should be."""
-    with zipfile.ZipFile(io.BytesIO(_checkpoint_bytes(some_scene()))) as archive:
+def _checkpoint_bytes(scene: Gaussians) -> bytes:
+    content: dict[str, object] = {"step": 1, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    content["pipeline"] = {f"_model.gauss_params.{name}": value for name, value in scene.items()}
+    return _saved(content)
+
+
+def gsplat_bytes(scene: Gaussians) -> bytes:
+    """A checkpoint of gsplat's trainer."""
+    values = dict(scene.items()) | {"opacities": scene.opacities[:, 0], "sh0": scene.features_dc[:, None]}
+    values["shN"] = values.pop("features_rest")
+    del values["features_dc"]
+    return _saved({"step": 1, "splats": values})
+
+
+def inria_bytes(scene: Gaussians) -> bytes:
+    """A checkpoint of INRIA's 3D Gaussian Splatting, without the optimiser's numbers."""
+    values = (scene.means, scene.features_dc[:, None], scene.features_rest, scene.scales, scene.quats, scene.opacities)
+    return _saved(((scene.sh_degree, *values, *[torch.zeros(len(scene))] * 3, {"state": {}}, 3.0), 1))
+
+
+def _zip_of(parts: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+    return stream.getvalue()
+
+
+def _pickle_in(checkpoint: bytes) -> Make:
+    """The reader of the pickle in a checkpoint, whose numbers are as they should be."""
+    with zipfile.ZipFile(io.BytesIO(checkpoint)) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
+    [pickle] = (name for name in parts if name.endswith("/data.pkl"))
+    return at("a.ckpt", _scene, inside=lambda data: _zip_of(parts | {pickle: data}))
 
-    def with_pickle(data: bytes) -> bytes:
-        stream = io.BytesIO()
-        with zipfile.ZipFile(stream, "w") as archive:
-            for name, part in parts.items():
-                archive.writestr(name, data if name.endswith("/data.pkl") else part)
-        return stream.getvalue()
 
-    return at("a.ckpt", _scene, inside=with_pickle)(folder)
+READERS |= {
+    "checkpoint-pickle": _pickle_in(_checkpoint_bytes(some_scene())),
+    "gsplat-pickle": _pickle_in(gsplat_bytes(some_scene())),
+    "inria-pickle": _pickle_in(inria_bytes(some_scene())),
+}
 
 
 def _safetensors(header: bytes, numbers: int) -> bytes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,12 @@ from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits, sh_
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.ply_dialects import (
     COLORS,
+    COLUMNS,
     FILTER,
-    dc_of_colors,
-    fuse_filter,
+    attributes_of,
+    columns_of,
     has_plain_colors,
+    is_flat,
     with_plain_names,
 )
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
@@ -33,16 +35,6 @@ from pointsplat_ns.system.pieces import CHUNK
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
-
-_COLUMNS = {
-    "means": ["x", "y", "z"],
-    "normals": ["nx", "ny", "nz"],
-    "features_dc": ["f_dc_0", "f_dc_1", "f_dc_2"],
-    "opacities": ["opacity"],
-    "scales": ["scale_0", "scale_1", "scale_2"],
-    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
-}
-"""Vertex properties of the attributes; normals are written as zeros and not read."""
 
 
 def read_ply(path: Path | str) -> Gaussians:
@@ -223,8 +215,8 @@ def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
 
 def _column_names(rest: int) -> list[str]:
     """All vertex properties in the order of files, with so many of SH beyond the constant one."""
-    first = [*_COLUMNS["means"], *_COLUMNS["normals"], *_COLUMNS["features_dc"]]
-    last = [*_COLUMNS["opacities"], *_COLUMNS["scales"], *_COLUMNS["quats"]]
+    first = [*COLUMNS["means"], *COLUMNS["normals"], *COLUMNS["features_dc"]]
+    last = [*COLUMNS["opacities"], *COLUMNS["scales"], *COLUMNS["quats"]]
     return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]
 
 
@@ -265,16 +257,11 @@ def _gaussian_element(header: Header, path: Path) -> Element:
     return vertex
 
 
-def _is_flat(names: Container[str]) -> bool:
-    """Whether vertex properties are those of 2D Gaussians, whose third axis is their normal and has no size."""
-    return "scale_2" not in names and all(name in names for name in ("scale_0", "scale_1", "opacity"))
-
-
 def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) -> None:
     """Warn of what a file holds beside the Gaussians that are read."""
     if in_file > MAX_REST:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-    known = {name for names in _COLUMNS.values() for name in names} | {FILTER}
+    known = {name for names in COLUMNS.values() for name in names} | {FILTER}
     present = {name for name, _ in vertex.properties}
     if has_plain_colors(present):
         known |= {*COLORS}
@@ -304,15 +291,15 @@ def _num_rest(vertex: Element, path: Path) -> int:
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
-    if _is_flat(present):
+    if is_flat(present):
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")
     if has_plain_colors(present):
-        present |= {*_COLUMNS["features_dc"]}
+        present |= {*COLUMNS["features_dc"]}
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
     required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
-    missing = [name for name in required if name not in present and name not in _COLUMNS["normals"]]
+    missing = [name for name in required if name not in present and name not in COLUMNS["normals"]]
     if missing:
         others = f" and {len(missing) - 1} more ({', '.join(missing[1:4])}...)" if len(missing) > 1 else ""
         raise SceneError(f"{path}: lacks the vertex property {missing[0]!r}{others}; expected a 3DGS PLY")
@@ -330,16 +317,9 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
     from numpy.lib.recfunctions import structured_to_unstructured
 
     kinds = rows_of(slice(0, 0)).dtype
-    names = kinds.names or ()
-    flat, plain_colors = _is_flat(names), has_plain_colors(names)
-    columns = {
-        **{name: _COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
-        # Channel-major in the file, channel last in a scene.
-        "scales": _COLUMNS["scales"][: 2 if flat else 3],
-        "features_dc": COLORS if plain_colors else _COLUMNS["features_dc"],
-        FILTER: [FILTER] if FILTER in names else [],
-        "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
-    }
+    # Channel-major in the file, channel last in a scene.
+    rest = [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)]
+    columns = columns_of(kinds.names or ()) | {"features_rest": rest}
     tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
     at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
     # A double beyond float32 becomes Inf and is dropped with the others.
@@ -350,13 +330,6 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
             for name, fields in columns.items():
                 if fields:
                     tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
-    filters = tables.pop(FILTER)
-    if filters.shape[1]:
-        tables["scales"], tables["opacities"] = fuse_filter(tables["scales"], tables["opacities"], filters)
-    if plain_colors:
-        tables["features_dc"] = dc_of_colors(tables["features_dc"], kinds["red"])
-    if flat:
-        tables["scales"] = np.column_stack([tables["scales"], np.full(count, -np.inf, np.float32)])
-    tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
+    tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, kinds).items()}
     tensors["features_rest"] = tensors["features_rest"].reshape(count, k, 3)
     return Gaussians(**tensors, antialiased=traits.antialiased, up=traits.up)

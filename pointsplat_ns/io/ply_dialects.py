@@ -17,6 +17,18 @@ from numpy.typing import NDArray
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.ply_header import Header
 
+Table = NDArray[np.float32]
+
+COLUMNS = {
+    "means": ["x", "y", "z"],
+    "normals": ["nx", "ny", "nz"],
+    "features_dc": ["f_dc_0", "f_dc_1", "f_dc_2"],
+    "opacities": ["opacity"],
+    "scales": ["scale_0", "scale_1", "scale_2"],
+    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+}
+"""Vertex properties of the attributes; normals are written as zeros and not read."""
+
 COLORS = ["red", "green", "blue"]
 FILTER = "filter_3D"
 
@@ -38,21 +50,47 @@ def with_plain_names(header: Header) -> Header:
     return replace(header, elements=tuple(elements))
 
 
+def is_flat(names: Container[str]) -> bool:
+    """Whether vertex properties are those of 2D Gaussians, whose third axis is their normal and has no size."""
+    return "scale_2" not in names and all(name in names for name in ("scale_0", "scale_1", "opacity"))
+
+
 def has_plain_colors(names: Container[str]) -> bool:
     """Whether vertex properties have colours as red, green and blue alone."""
     return "f_dc_0" not in names and all(name in names for name in COLORS)
 
 
-def dc_of_colors(colors: NDArray[np.float32], kind: np.dtype) -> NDArray[np.float32]:
+def columns_of(names: Container[str]) -> dict[str, list[str]]:
+    """The vertex properties to read for each attribute but ``features_rest``, and for the 3D filter."""
+    return {
+        **{name: COLUMNS[name] for name in ("means", "quats", "opacities")},
+        "scales": COLUMNS["scales"][: 2 if is_flat(names) else 3],
+        "features_dc": COLORS if has_plain_colors(names) else COLUMNS["features_dc"],
+        FILTER: [FILTER] if FILTER in names else [],
+    }
+
+
+def attributes_of(tables: dict[str, Table], kinds: np.dtype) -> dict[str, Table]:
+    """The attributes of a scene, float32, of what :func:`columns_of` named, float32, from rows of these types."""
+    names = kinds.names or ()
+    found = {name: table for name, table in tables.items() if name != FILTER}
+    if FILTER in names:
+        found["scales"], found["opacities"] = fuse_filter(found["scales"], found["opacities"], tables[FILTER])
+    if has_plain_colors(names):
+        found["features_dc"] = _dc_of_colors(found["features_dc"], kinds["red"])
+    if is_flat(names):
+        found["scales"] = np.column_stack([found["scales"], np.full(len(found["scales"]), -np.inf, np.float32)])
+    return found
+
+
+def _dc_of_colors(colors: Table, kind: np.dtype) -> Table:
     """Constant SH coefficients (N, 3) of red, green and blue (N, 3): whole numbers count in the largest of their type,
     others are in [0, 1]."""
     largest = np.iinfo(kind).max if kind.kind in "iu" else 1
     return ((colors / np.float32(largest) - np.float32(0.5)) / np.float32(SH_C0)).astype(np.float32)
 
 
-def fuse_filter(
-    scales: NDArray[np.float32], opacities: NDArray[np.float32], sizes: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def fuse_filter(scales: Table, opacities: Table, sizes: Table) -> tuple[Table, Table]:
     """Sizes and opacities with Mip-Splatting's 3D filter in them.
 
     A standard deviation s becomes sqrt(s^2 + f^2), and an opacity is multiplied by the product of s / sqrt(s^2 + f^2)
