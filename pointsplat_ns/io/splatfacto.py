@@ -16,7 +16,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, logger, one_line, require_file, require_memory
+from pointsplat_ns.io.files import keep_usable, logger, one_line, read_text, require_file, require_memory
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 
 EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"
@@ -39,8 +39,9 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
     logits, they are converted to SH coefficients of the same colour. Of gsplat's trainings on several GPUs all parts
-    are read. Of 3D Gaussian Splatting the bands of SH are read that the training drew at that step. Gaussians that
-    cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
+    are read, and the ``cfg.yml`` of the training says whether it drew antialiased. Of 3D Gaussian Splatting the bands
+    of SH are read that the training drew at that step. Gaussians that cannot be drawn (NaN, or Inf where it is not
+    valid) are dropped, and their number is logged.
 
     Returns:
         The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the run's dataparser.
@@ -49,7 +50,11 @@ def read_checkpoint(path: Path | str) -> Gaussians:
         SceneError: if the file is truncated, is no checkpoint, or is one of another method.
     """
     path = require_file(path, "a checkpoint")
-    parts = [_scene_of(open_checkpoint(part), part) for part in checkpoint_parts(path)]
+    parts = []
+    for part in checkpoint_parts(path):
+        found = open_checkpoint(part)
+        antialiased = found.program == "gsplat" and _gsplat_antialiased(part)
+        parts.append(_scene_of(found, part).replace(antialiased=antialiased))
     if len({part.sh_degree for part in parts}) > 1:
         raise SceneError(f"{path}: its parts have different SH degrees; expected those of one training")
     if len(parts) > 1:
@@ -112,6 +117,16 @@ def _of_gsplat(splats: dict[str, Any], step: Any, path: Path) -> Checkpoint:
         )
     keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
     return Checkpoint("gsplat", _step(step), {name: (key, splats.get(key)) for name, key in keys.items()})
+
+
+def _gsplat_antialiased(path: Path) -> bool:
+    """Whether the settings of a training with gsplat, ``cfg.yml`` above the checkpoint's folder, say that it drew
+    antialiased; False if there are none."""
+    try:
+        text = read_text(path.absolute().parents[1] / "cfg.yml", 1 << 20)
+    except (OSError, ValueError, IndexError):
+        return False
+    return re.search(r"^antialiased: true\s*$", text, re.M) is not None
 
 
 def _of_3dgs(captured: Any, step: Any, path: Path) -> Checkpoint:

@@ -11,6 +11,8 @@ from making import normal_scene, same_bits
 from pointsplat_ns.io.scene import kind_of
 from pointsplat_ns.io.source import source_file
 
+GOOD = normal_scene(4, 1)
+
 
 def splats_of(scene):
     """What ``splats.state_dict()`` of gsplat's simple_trainer holds: a ParameterDict, opacities (N,), sh0 (N, 1, 3)."""
@@ -44,6 +46,19 @@ def test_a_checkpoint_of_gsplat_is_read_to_the_bit(tmp_path, degree):
     torch.save({"step": 29999, "splats": splats_of(scene), "pose_adjust": {"embeds.weight": torch.zeros(3, 9)}}, path)
     assert same_bits(ps.load(path), scene)
     assert kind_of(path) == ps.info(path).format == "checkpoint of gsplat, step 29999"
+
+
+@pytest.mark.parametrize(
+    "settings", ["antialiased: true\n", "antialiased: false\n", "nested:\n  antialiased: true\n", None]
+)
+def test_the_settings_of_a_training_with_gsplat_say_whether_it_is_drawn_antialiased(tmp_path, settings):
+    path = tmp_path / "results" / "ckpts" / "ckpt_29999_rank0.pt"
+    path.parent.mkdir(parents=True)
+    torch.save({"step": 29999, "splats": splats_of(GOOD)}, path)
+    if settings is not None:
+        config = tmp_path / "results" / "cfg.yml"
+        config.write_text(f"absgrad: false\n{settings}strategy: !!python/object:gsplat.strategy.DefaultStrategy {{}}\n")
+    assert ps.load(path).antialiased == (settings == "antialiased: true\n")
 
 
 def test_parts_of_several_gpus_are_one_scene_whichever_is_named(tmp_path):
@@ -117,9 +132,6 @@ def test_rows_that_cannot_be_drawn_are_dropped_and_counted(tmp_path, caplog):
 class Bomb:
     def __reduce__(self):
         return (print, ("this must never be printed",))
-
-
-GOOD = normal_scene(4, 1)
 
 
 @pytest.mark.parametrize(
