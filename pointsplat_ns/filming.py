@@ -100,7 +100,9 @@ def render_path(
     sources = [scene] if other is None else [scene, other]
     given = views_for(scene, views).resized(CAMERA_PATH.photo_side) if isinstance(views, (str, Path)) else views
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
+    loaded = [one.at_offset(loaded[0].offset) for one in loaded]
     if given is not None and isinstance(views, (str, Path)):
+        given = given.relative_to(loaded[0].offset)
         check_views_show(loaded[0], given, views)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
@@ -165,9 +167,10 @@ def open_viewer(
         loaded = load(path)
         return ViewedScene(name, None, loaded, _source(loaded, loaded, None))
 
-    scenes = []
+    scenes: list[ViewedScene] = []
     for index, source in enumerate(source for source in (scene, other) if source is not None):
         loaded = source if isinstance(source, Gaussians) else load(source)
+        loaded = loaded.at_offset(scenes[0].scene.offset) if scenes else loaded
         path = None if isinstance(source, Gaussians) else Path(source)
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
         scenes.append(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.placing import place
@@ -173,6 +175,7 @@ def convert_folder(
     up: str | None = None,
     scale: float = 1.0,
     original_frame: bool = False,
+    offset: Sequence[float] | Literal["centre"] | None = None,
     jobs: int = 1,
     shard: str | None = None,
     force: bool = False,
@@ -183,7 +186,8 @@ def convert_folder(
     if not suffix.startswith(".") or format_to_write(suffix).suffix != suffix:
         raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
     options: CommandOptions = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
-    command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame), options, suffix)
+    options = options if offset is None else {**options, "offset": str(offset)}
+    command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame, offset), options, suffix)
     return _run(folder, output, command, jobs, shard, force, progress)
 
 
@@ -250,11 +254,18 @@ def _pruned(
     return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr, source.missing[2:-1])
 
 
-def _converted(sh: str, up: str | None, scale: float, original_frame: bool, path: Path) -> SmallerScene:
+def _converted(
+    sh: str,
+    up: str | None,
+    scale: float,
+    original_frame: bool,
+    offset: Sequence[float] | Literal["centre"] | None,
+    path: Path,
+) -> SmallerScene:
     """One scene of a folder for another format."""
     dense = read_scene(path)
     cut = dense if sh == "all" else cut_sh(dense, int(sh))
-    return SmallerScene(place(cut, up, scale, path if original_frame else None), len(dense), None)
+    return SmallerScene(place(cut, up, scale, path if original_frame else None, offset), len(dense), None)
 
 
 def _found(

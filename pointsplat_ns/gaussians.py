@@ -7,6 +7,7 @@ quaternions, SH coefficients), so that reading and writing lose nothing. Activat
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import AXES
+from pointsplat_ns.system.tensors import DOUBLES
 
 MAX_SH_DEGREE = 3
 
@@ -37,11 +39,16 @@ def sh_degree_of(num_rest: int) -> int:
     )
 
 
+Offset = tuple[float, float, float]
+"""Where the origin of a scene lies in the frame of its file, scene units."""
+
+
 class Traits(NamedTuple):
     """What files declare of a scene beside its Gaussians; see :class:`Gaussians`."""
 
     antialiased: bool = False
     up: str | None = None
+    offset: Offset | None = None
 
 
 PLAIN = Traits()
@@ -62,10 +69,12 @@ class Gaussians:
         features_rest: (N, (d+1)^2 - 1, 3) the other coefficients of SH degree d, from 0 to 3.
         antialiased: whether the scene was trained to be drawn antialiased (Mip-Splatting), and so is.
         up: the axis that is up, "x", "y", "z", "-x", "-y" or "-z", if the scene's file declares it; else None.
+        offset: where the origin of ``means`` lies in the frame of the scene's file and of its poses, scene units, as
+            that of a geo-referenced scene; None for (0, 0, 0).
 
     Raises:
         SceneError: if a shape, device or dtype does not fit the others, no SH degree has this number of coefficients,
-            or ``up`` is no axis.
+            ``up`` is no axis, or ``offset`` is not three finite numbers.
 
     Example:
         Two Gaussians: a grey ball of standard deviation 0.1, nearly opaque, and a red disc beside it.
@@ -96,6 +105,7 @@ class Gaussians:
     features_rest: Tensor  # [N, (d+1)^2 - 1, 3] the other SH coefficients
     antialiased: bool = dataclasses.field(default=False, kw_only=True)
     up: str | None = dataclasses.field(default=None, kw_only=True)
+    offset: Offset | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         tails = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
@@ -117,6 +127,8 @@ class Gaussians:
             raise SceneError(f"parameters are {self.means.dtype}; expected a floating-point type")
         if self.up is not None and self.up not in AXES:
             raise SceneError(f"up is {self.up!r}; expected {', '.join(AXES[:-1])} or {AXES[-1]}")
+        if self.offset is not None and not (len(self.offset) == 3 and all(map(math.isfinite, self.offset))):
+            raise SceneError(f"offset is {self.offset!r}; expected three finite numbers")
 
     @classmethod
     def empty(
@@ -130,9 +142,11 @@ class Gaussians:
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
         """All Gaussians of several scenes of one SH degree, in order; antialiased if one of the scenes is, with
-        the up axis of the first."""
-        parts = zip(*(scene.tensors() for scene in scenes), strict=True)
-        return cls(*map(torch.cat, parts), antialiased=any(scene.antialiased for scene in scenes), up=scenes[0].up)
+        the up axis and the offset of the first."""
+        first = scenes[0]
+        parts = zip(*(scene.at_offset(first.offset).tensors() for scene in scenes), strict=True)
+        traits = first.traits._replace(antialiased=any(scene.antialiased for scene in scenes))
+        return cls(*map(torch.cat, parts), **traits._asdict())
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """``(name, tensor)`` of every parameter, in the order of the fields."""
@@ -149,6 +163,15 @@ class Gaussians:
     def replace(self, **changes: Any) -> Gaussians:
         """A scene with some attributes replaced."""
         return dataclasses.replace(self, **changes)
+
+    def at_offset(self, offset: Offset | None) -> Gaussians:
+        """The same scene with its positions about another point of its file's frame, moved in float64."""
+        old, new = self.offset or (0.0, 0.0, 0.0), offset or (0.0, 0.0, 0.0)
+        declared = new if any(new) else None
+        if old == new:
+            return self if self.offset == declared else self.replace(offset=declared)
+        shift = torch.tensor([a - b for a, b in zip(old, new, strict=True)], **DOUBLES).to(self.device)
+        return self.replace(means=(self.means.double() + shift).to(self.dtype), offset=declared)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -174,7 +197,7 @@ class Gaussians:
     @property
     def traits(self) -> Traits:
         """What a file declares of the scene beside its Gaussians."""
-        return Traits(self.antialiased, self.up)
+        return Traits(self.antialiased, self.up, self.offset)
 
     @property
     def device(self) -> torch.device:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.system.tensors import FLOATS
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 RasterizeMode = Literal["classic", "antialiased"]
 """The rasterize mode of a scene's training (nerfstudio's ``rasterize_mode``)."""
@@ -123,6 +123,15 @@ class Views:
 
     def __iter__(self) -> Iterator[View]:
         return (self[index] for index in range(len(self)))
+
+    def relative_to(self, offset: tuple[float, float, float] | None) -> Views:
+        """The same views for a scene whose positions are relative to an offset, scene units; computed in float64."""
+        if offset is None:
+            return self
+        viewmats = self.viewmats.double()
+        moved = viewmats.clone()
+        moved[:, :3, 3] += viewmats[:, :3, :3] @ torch.tensor(offset, **DOUBLES).to(viewmats.device)
+        return replace(self, viewmats=moved.to(self.viewmats.dtype))
 
     def spread(self, count: int) -> Views:
         """At most ``count`` of the views, evenly spread over their order, with the first and the last."""

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -23,6 +23,8 @@ def convert(
     up: str | None = None,
     scale: float = 1.0,
     original_frame: bool = False,
+    recentre: bool = False,
+    offset: tuple[float, float, float] | None = None,
     spz_version: Literal[3, 4] = 3,
     spz_sh_bits: tuple[int, int] | None = None,
     to: str | None = None,
@@ -43,6 +45,9 @@ def convert(
             -y:z names it as -y. Write --up=-y for a negative axis.
         scale: factor on positions and sizes.
         original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
+        recentre: write positions relative to their rounded median, so that float32 keeps their digits. The offset is
+            kept in .ply, .compressed.ply and .glb files.
+        offset: write positions relative to this point of the scene's frame; 0 0 0 writes them in the frame itself.
         spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
         spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
             larger file and a better picture. By default 6 and 5; SH from an .spz file stay as they are.
@@ -60,6 +65,9 @@ def convert(
     from pointsplat_ns.pruning import cut_sh
     from pointsplat_ns.system.progress import progress_bar
 
+    if recentre and offset is not None:
+        raise ps.PointSplatError("--recentre and --offset both given; expected one of them")
+    point: Any = "centre" if recentre else offset
     if is_folder_of_scenes(scene):
         from pointsplat_ns.folders import convert_folder
 
@@ -68,7 +76,7 @@ def convert(
         one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
         return folder_command(
             convert_folder, scene, output, one, json_output, jobs,
-            suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, shard=shard, force=force,
+            suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, offset=point, shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
     if to is not None:
@@ -77,7 +85,7 @@ def convert(
     start = time.perf_counter()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
-    after = ps.place(after, up, scale, scene if original_frame else None)
+    after = ps.place(after, up, scale, scene if original_frame else None, point)
     kind = format_to_write(output)
     if kind.suffix == ".spz":
         encode = functools.partial(encode_spz, version=spz_version, sh_bits=spz_sh_bits)
@@ -90,4 +98,6 @@ def convert(
         return
     cut = f" cut to {after.sh_degree}" if after.sh_degree < before.sh_degree else ""
     degree = f"SH degree {before.sh_degree}{cut}"
+    if point is not None and after.offset is not None:
+        print(f"positions are relative to {' '.join(map(repr, after.offset))}")
     print(f"{output}: {len(after):,} Gaussians, {degree}, {written_size(output)}, in {seconds_text(seconds)}")

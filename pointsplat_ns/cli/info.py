@@ -103,6 +103,8 @@ def _print(found: SceneInfo) -> None:
 
     print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
     print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{', antialiased' if found.antialiased else ''}")
+    if found.offset:
+        print(f"positions are relative to {' '.join(map(repr, found.offset))}")
     print(f"up: {found.up_text}{'; --up names another axis' if found.up_is_guess else ''}")
     if found.fill is not None:
         print(f"fill: {found.fill:.1f} Gaussians drawn per pixel, in {found.views}")

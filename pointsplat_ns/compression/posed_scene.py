@@ -22,12 +22,14 @@ def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussi
     are those of :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`check_views_show`."""
     views = views_for(scene, poses)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
+    views = views.relative_to(dense.offset)
     check_views_show(dense, views, poses)
     return dense, views
 
 
 def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
     """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side, as in 3DGS training.
+    They are in the frame of the scene's file: :meth:`~pointsplat_ns.views.Views.relative_to` brings them to its offset.
 
     A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
     scene's frame. Raises SceneError if a file is missing, or the

@@ -135,7 +135,7 @@ def prune_file(
     if request.sh.isdigit():
         rows = replace(rows, rest=min(rows.rest, (int(request.sh) + 1) ** 2 - 1))
     most = _most_in_cell(rows, memory)
-    known = None if poses is None else views_for(rows.path, poses)
+    known = None if poses is None else views_for(rows.path, poses).relative_to(rows.traits.offset)
     if known is not None and resolution is not None:
         known = known.resized(max(resolution))
     status = rows.path.stat()

@@ -51,6 +51,8 @@ class SceneInfo:
     sh_degree: int
     antialiased: bool
     """Whether the scene was trained with antialiasing, as its file or run says."""
+    offset: list[float]
+    """Where the origin of positions lies in the frame of the file, scene units; empty if they are in that frame."""
     up: list[float]
     """The direction that is up, of length 1; empty if nothing is visible."""
     up_is_guess: bool
@@ -133,6 +135,7 @@ def info(
         gaussians=len(scene),
         sh_degree=scene.sh_degree,
         antialiased=scene.antialiased,
+        offset=[] if scene.offset is None else [*scene.offset],
         up=[] if up_found is None else up_found.direction.tolist(),
         up_is_guess=up_found is not None and not up_found.sure,
         fill=filled,

@@ -11,15 +11,16 @@ import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits, sh_degree_of
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits, sh_degree_of
 from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
+from pointsplat_ns.io.offsets import SAMPLED, has_doubles, positions_of, shift_of, with_shift
 from pointsplat_ns.io.ply_dialects import (
     COLORS,
     COLUMNS,
@@ -63,7 +64,9 @@ def read_ply(path: Path | str) -> Gaussians:
         else:
             with _GaussiansAlone(path, header) as stream:
                 rows = PlyData.read(stream)["vertex"].data
-            scene = _scene(len(rows), lambda these: rows[these], k, in_file, _traits(header, vertex, path))
+            shift = shift_of(rows[:: max(1, len(rows) // SAMPLED)])
+            traits = with_shift(_traits(header, vertex, path), shift, path)
+            scene = _scene(len(rows), lambda these: rows[these], k, in_file, traits, shift)
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     except (PlyParseError, ValueError, OverflowError) as error:
@@ -89,6 +92,8 @@ class PlyRows:
     """Where the first row begins, bytes."""
     _in_file: int
     """Number of SH coefficients per channel beyond the constant one in the file."""
+    _shift: Offset | None = None
+    """What is subtracted from positions."""
 
     @classmethod
     def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
@@ -107,7 +112,13 @@ class PlyRows:
         """The rows of a file with what :func:`_checked` found in it."""
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        return cls(path, vertex.count, min(in_file, MAX_REST), _traits(header, vertex, path), dtype, start, in_file)
+        rows = cls(path, vertex.count, min(in_file, MAX_REST), _traits(header, vertex, path), dtype, start, in_file)
+        if vertex.count and has_doubles(dtype):
+            with rows._opened() as stream:
+                some = range(0, vertex.count, max(1, vertex.count // SAMPLED))
+                shift = shift_of(rows._table(b"".join(rows._row(number, stream) for number in some), len(some)))
+            rows = replace(rows, traits=with_shift(rows.traits, shift, path), _shift=shift)
+        return rows
 
     def __len__(self) -> int:
         return self.count
@@ -127,14 +138,18 @@ class PlyRows:
 
     def pick(self, rows: Sequence[int]) -> Gaussians:
         """The Gaussians of single rows, as :meth:`read` gives them."""
-        size = self._dtype.itemsize
-
-        def row(number: int, stream: io.BufferedReader) -> bytes:
-            stream.seek(self._start + number * size)
-            return stream.read(size)
-
         with self._opened() as stream:
-            return self._scene(len(rows), lambda these: b"".join(row(number, stream) for number in rows[these]))
+            return self._scene(len(rows), lambda these: b"".join(self._row(number, stream) for number in rows[these]))
+
+    def _row(self, number: int, stream: io.BufferedReader) -> bytes:
+        stream.seek(self._start + number * self._dtype.itemsize)
+        return stream.read(self._dtype.itemsize)
+
+    def _table(self, data: bytes, count: int) -> np.ndarray:
+        """The rows (count,) in bytes of the file. Raises SceneError if it has become shorter."""
+        if len(data) < self._dtype.itemsize * count:
+            raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
+        return np.frombuffer(data, self._dtype)
 
     @contextmanager
     def _opened(self) -> Iterator[io.BufferedReader]:
@@ -149,12 +164,9 @@ class PlyRows:
         """The Gaussians of ``count`` rows, of which ``bytes_of`` gives those of a slice."""
 
         def rows_of(these: slice) -> np.ndarray:
-            data = bytes_of(these)
-            if len(data) < self._dtype.itemsize * (these.stop - these.start):
-                raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
-            return np.frombuffer(data, self._dtype)
+            return self._table(bytes_of(these), these.stop - these.start)
 
-        return _scene(count, rows_of, self.rest, self._in_file, self.traits)
+        return _scene(count, rows_of, self.rest, self._in_file, self.traits, self._shift)
 
 
 def _checked(path: Path) -> tuple[Header, Element, int]:
@@ -311,9 +323,16 @@ def _num_rest(vertex: Element, path: Path) -> int:
     return len(rest) // 3
 
 
-def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: int, traits: Traits) -> Gaussians:
+def _scene(
+    count: int,
+    rows_of: Callable[[slice], np.ndarray],
+    k: int,
+    in_file: int,
+    traits: Traits,
+    shift: Offset | None,
+) -> Gaussians:
     """The scene in ``count`` structured rows, of which ``rows_of`` gives those of a slice, with ``k`` coefficients per
-    channel beyond the constant one, of ``in_file`` that the file has."""
+    channel beyond the constant one, of ``in_file`` that the file has. ``shift`` is subtracted from positions."""
     from numpy.lib.recfunctions import structured_to_unstructured
 
     kinds = rows_of(slice(0, 0)).dtype
@@ -327,9 +346,11 @@ def _scene(count: int, rows_of: Callable[[slice], np.ndarray], k: int, in_file: 
         for start in range(0, count, at_once):
             chunk = slice(start, min(start + at_once, count))
             rows = rows_of(chunk)
+            if shift is not None:
+                tables["means"][chunk] = positions_of(rows) - shift
             for name, fields in columns.items():
-                if fields:
+                if fields and not (name == "means" and shift is not None):
                     tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
     tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, kinds).items()}
     tensors["features_rest"] = tensors["features_rest"].reshape(count, k, 3)
-    return Gaussians(**tensors, antialiased=traits.antialiased, up=traits.up)
+    return Gaussians(**tensors, antialiased=traits.antialiased, up=traits.up, offset=traits.offset)

@@ -18,6 +18,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.geometry.transforms import AXES
 from pointsplat_ns.io.files import logger
+from pointsplat_ns.io.offsets import offset_of_text, offset_text
 
 MAX_HEADER_BYTES = 1 << 20
 """A 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold."""
@@ -35,6 +36,8 @@ ANTIALIASED = "SplatRenderMode: mip"
 """The comment of a scene that was trained with antialiasing, as Brush and splat-transform write it."""
 UP = "Vertical Axis: "
 """The start of the comment that names the up axis, as nerfstudio writes it."""
+OFFSET = "Offset: "
+"""The start of the comment with the offset of positions: three numbers that are added to x, y and z."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,7 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
 def first_lines(traits: Traits) -> list[str]:
     """The lines of a header before its elements."""
     comments = [ANTIALIASED] * traits.antialiased + ([] if traits.up is None else [UP + traits.up])
+    comments += [] if traits.offset is None else [OFFSET + offset_text(traits.offset)]
     return ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
 
 
@@ -134,7 +138,7 @@ def traits_of(header: Header, path: Path) -> Traits:
     Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``, nerfstudio
     ``Vertical Axis: z``.
     """
-    found, up = False, None
+    found, up, offset = False, None, None
     for comment in header.comments:
         words = comment.lower().replace(":", " ").split()
         if words[:1] == ["splatrendermode"] and len(words) > 1:
@@ -145,7 +149,11 @@ def traits_of(header: Header, path: Path) -> Traits:
             found = words[1] == "1"
         elif words[:2] == ["vertical", "axis"] and len(words) == 3 and words[2].removeprefix("+") in AXES:
             up = words[2].removeprefix("+")
-    return Traits(found, up)
+        elif comment.startswith(OFFSET):
+            offset = offset_of_text(comment.removeprefix(OFFSET))
+            if offset is None:
+                logger.warning("%s: no offset of three numbers in the comment %r", path, comment[:80])
+    return Traits(found, up, offset)
 
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:

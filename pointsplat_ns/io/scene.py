@@ -12,6 +12,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, logger, require_file
 from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
 from pointsplat_ns.io.formats.holding import losses
+from pointsplat_ns.io.offsets import warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
@@ -38,6 +39,8 @@ def is_folder_of_scenes(path: Path | str) -> bool:
 def read_scene(path: Path | str) -> Gaussians:
     """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a Splatfacto run.
 
+    Positions that are doubles far from the origin, as in geo-referenced PLYs, are read relative to an offset, which is
+    that of the scene. Where float32 has lost their digits already, that is logged.
     The content of a file decides its format, else its name.
 
     Args:
@@ -75,6 +78,7 @@ def read_scene(path: Path | str) -> Gaussians:
         )
         raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
     scene = kind.read(path)
+    warn_if_far(scene, path)
     if kind.read is read_checkpoint:
         with suppress(SceneError):  # a checkpoint outside a run
             return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")

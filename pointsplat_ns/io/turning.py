@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import Gaussians, Offset
 from pointsplat_ns.geometry.harmonics import sh_matrix
 from pointsplat_ns.geometry.transforms import axis_along, direction_of, quaternions_of, zero_as_identity
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaussians:
@@ -40,7 +41,16 @@ def turned(scene: Gaussians, matrix: Tensor, quat: Tensor | None = None) -> Gaus
         quats=(turn * Quaternion(zero_as_identity(scene.quats))).data,
         features_rest=torch.cat(rest, dim=1) if rest else scene.features_rest,
         up=None if scene.up is None else axis_along(matrix @ direction_of(scene.up)),
+        offset=_times(scene.offset, matrix),
     )
+
+
+def _times(offset: Offset | None, matrix: Tensor) -> Offset | None:
+    """An offset after a linear map (3, 3), float64."""
+    if offset is None:
+        return None
+    x, y, z = (matrix @ torch.tensor(offset, **DOUBLES)).tolist()
+    return x, y, z
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,5 +69,7 @@ class Similarity:
         """The scene after the transform. Its SH are turned too; a mirrored scene has mirrored SH."""
         moved = turned(scene.to(dtype=torch.float64), self.matrix)
         return moved.replace(
-            means=moved.means * self.scale + self.offset.to(moved.means), scales=moved.scales + math.log(self.scale)
+            means=moved.means * self.scale + self.offset.to(moved.means),
+            scales=moved.scales + math.log(self.scale),
+            offset=_times(moved.offset, self.scale * torch.eye(3, **DOUBLES)),
         ).to(dtype=scene.dtype)

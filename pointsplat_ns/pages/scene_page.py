@@ -77,6 +77,7 @@ def write_page(
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
     check_limit(limit_mb)
     upward = up_named(up)
+    scenes = [scene.at_offset(scenes[0].offset) for scene in scenes]
     for scene in scenes:
         need_usable(scene)
     rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]

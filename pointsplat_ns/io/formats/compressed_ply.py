@@ -133,6 +133,7 @@ HOLDS = Holds(
     opacities=Span(0.0, 1.0, 1 / 255),
     rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 1023),
     sh=SH,
+    offset=True,
     position_steps=lambda scene: _steps(scene.means.double().numpy(), scene, _BITS_3),
     colour_steps=lambda scene: _steps(scene.features_dc.double().numpy(), scene, _BITS_4),
     fitted=fitted,

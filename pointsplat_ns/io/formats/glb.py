@@ -7,6 +7,7 @@ and colours as bytes for programs that know only points; read are all types that
 from __future__ import annotations
 
 import json
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Traits
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
@@ -34,6 +35,7 @@ from pointsplat_ns.io.formats.coding import (
 )
 from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
 from pointsplat_ns.io.formats.spz import decode_spz
+from pointsplat_ns.io.offsets import SAMPLED, offset_for
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
@@ -41,7 +43,7 @@ from pointsplat_ns.system.tensors import DOUBLES
 JSON_BYTES = 8192
 """The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
 
-HOLDS = Holds(sizes=FLOAT_SIZES, opacities=Span(0.0, 1.0), antialiased=False)
+HOLDS = Holds(sizes=FLOAT_SIZES, opacities=Span(0.0, 1.0), antialiased=False, offset=True)
 
 _EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz"
@@ -77,8 +79,31 @@ def read_glb(path: Path | str) -> Gaussians:
         if len(placed) > _MOST_PLACES:
             raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most {_MOST_PLACES}")
         require_memory(path, 4 * sum(len(mesh) * (11 + 3 * (mesh.sh_degree + 1) ** 2) for mesh, _ in placed))
-        moved = [_moved(mesh, matrix, path) for mesh, matrix in placed]
-    return keep_usable(joined(moved or [*meshes.values()]), path)
+        offset = _offset_of(*placed[0]) if placed else None
+        moved = [_moved(mesh, _translated(matrix, offset), path) for mesh, matrix in placed]
+        scene = joined(moved or [*meshes.values()])
+    return keep_usable(scene.replace(offset=offset), path)
+
+
+def _offset_of(mesh: Gaussians, matrix: Array) -> Offset | None:
+    """The translation of a node, if float32 would round the positions of its Gaussians too far there; else None."""
+    x, y, z = matrix[:3, 3].tolist()
+    some = mesh[:: max(1, len(mesh) // SAMPLED)]
+    if not (x or y or z):
+        return None
+    linear = matrix[:3, :3]
+    size = math.log(max(abs(float(np.linalg.det(linear))), 1e-300)) / 3
+    means = some.means.double().numpy() @ linear.T + matrix[:3, 3]
+    return None if offset_for(means, some.scales.double().numpy() + size) is None else (x, y, z)
+
+
+def _translated(matrix: Array, offset: Offset | None) -> Array:
+    """A node's matrix (4, 4) to the world about an offset."""
+    if offset is None:
+        return matrix
+    moved = matrix.copy()
+    moved[:3, 3] -= offset
+    return moved
 
 
 def _shown(content: dict[str, Any]) -> list[tuple[int, Array]]:
@@ -281,7 +306,7 @@ def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0} if scene.offset is None else {"mesh": 0, "translation": list(scene.offset)}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -16,6 +16,8 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0, basis_rows
 from pointsplat_ns.io.formats.rounding import weights
+from pointsplat_ns.io.offsets import offset_text
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Holds:
     """Steps (N,) of the constant SH coefficients of a scene, where they depend on it."""
     antialiased: bool = True
     """Whether files say that a scene was trained with antialiasing."""
+    offset: bool = False
+    """Whether files say the offset of positions."""
     fitted: Callable[[Gaussians], tuple[Gaussians, str]] | None = None
     """The scene as it is written, brought into the range where little is lost by that, and what was moved, in words."""
 
@@ -95,6 +99,8 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
     settings, found = HOLDING, []
     if scene.antialiased and not holds.antialiased:
         found.append("the mark of antialiased training")
+    if scene.offset is not None and not holds.offset:
+        found.append(f"the offset {offset_text(scene.offset)} of positions")
     if not len(scene):
         return found
     fitted, moved = (scene, "") if holds.fitted is None else holds.fitted(scene)
@@ -145,11 +151,11 @@ def seen_colours(dc: Tensor, rest: Tensor) -> Tensor:
 
 def _basis(count: int) -> Tensor:
     """The first ``count`` basis functions above degree 0, (count, D) float64, in directions on a spiral."""
-    number = torch.arange(HOLDING.directions, dtype=torch.float64)
+    number = torch.arange(HOLDING.directions, **DOUBLES)
     z = 1 - (2 * number + 1) / HOLDING.directions
     angle, radius = number * math.pi * (3 - math.sqrt(5)), (1 - z.square()).sqrt()
     rows = basis_rows(torch.stack([radius * angle.cos(), radius * angle.sin(), z]), 3)
-    return torch.stack(rows[1 : count + 1]) if count else torch.zeros(0, len(z), dtype=torch.float64)
+    return torch.stack(rows[1 : count + 1]) if count else torch.zeros(0, len(z), **DOUBLES)
 
 
 def within_colours(scene: Gaussians, colours: Span, sh: Span) -> Gaussians:
@@ -195,8 +201,8 @@ def _most_alike(dc: Tensor, rest: Tensor, colours: Span, sh: Span) -> tuple[Tens
         best_dc = torch.where(better, new_dc, best_dc)
         best_rest = torch.where(better[:, None], new_rest, best_rest)
 
-    for share in torch.linspace(0.0, 1.0, 17).tolist():
-        factor = share * fitting
+    for sixteenths in range(17):
+        factor = sixteenths / 16 * fitting
         for new_dc in (dark, *(dc + (1 - factor) * highest / SH_C0 for highest in (peak, seen)), dc):
             offer(new_dc.clamp(colours.low, colours.high), factor[:, None] * rest)
     offer(dc.clamp(colours.low, colours.high), rest.clamp(sh.low, sh.high))

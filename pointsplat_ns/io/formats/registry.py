@@ -104,7 +104,8 @@ FORMATS = (
         "compressed PLY", ".compressed.ply", read_compressed_ply, writer(encode_compressed_ply), _PLY,
         bytes_of=compressed_ply_bytes, capacity=compressed_ply.HOLDS, order=morton_order,
     ),
-    Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes),
+    Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes,
+           capacity=Holds(offset=True)),
     Format(
         "SPZ", ".spz", read_spz, writer(encode_spz), (b"\x1f\x8b\x08", b"NGSP"), encode=encode_spz,
         rounded=rounded_for_spz, capacity=spz_range.HOLDS,

@@ -1,0 +1,214 @@
+"""Scenes far from the origin: doubles keep their digits beside an offset, which files, poses and turns carry."""
+
+import json
+import logging
+import math
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import ball, cloud, same_bits
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression.posed_scene import read_posed
+from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.io.offsets import offset_for
+from pointsplat_ns.io.ply import PlyRows, row_table
+
+UTM = (451_234.6, 5_412_345.7, 312.4)
+
+
+def with_doubles(scene, path, origin=UTM, order="little", ascii_text=False):
+    """Write a PLY whose x, y and z are doubles about an origin, and return them, float64."""
+    rows = row_table(scene)
+    names = [line.split()[-1] for line in ply_lines(scene) if line.startswith("property")]
+    means = scene.means.double().numpy() + np.array(origin)
+    end = "<" if order == "little" else ">"
+    table = np.empty(len(scene), [(name, end + ("f8" if name in ("x", "y", "z") else "f4")) for name in names])
+    for column, name in enumerate(names):
+        table[name] = means[:, "xyz".index(name)] if name in ("x", "y", "z") else rows[:, column]
+    form = "ascii" if ascii_text else f"binary_{order}_endian"
+    head = ["ply", f"format {form} 1.0", f"element vertex {len(scene)}"]
+    head += [f"property {'double' if name in ('x', 'y', 'z') else 'float'} {name}" for name in names]
+    data = "\n".join([*head, "end_header", ""]).encode()
+    if ascii_text:
+        data += "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
+    else:
+        data += table.tobytes()
+    path.write_bytes(data)
+    return means
+
+
+def ply_lines(scene):
+    from pointsplat_ns.io.ply import header_bytes
+
+    return header_bytes(len(scene), scene.sh_degree).decode().splitlines()
+
+
+def absolute(scene):
+    """Positions in the frame of the file, float64."""
+    return scene.means.double().numpy() + np.array(scene.offset or (0, 0, 0))
+
+
+@pytest.mark.parametrize("form", ["little", "big", "ascii"])
+def test_doubles_keep_their_digits_beside_an_offset(tmp_path, caplog, form):
+    scene = cloud(300)
+    order = "big" if form == "big" else "little"
+    means = with_doubles(scene, tmp_path / "a.ply", order=order, ascii_text=form == "ascii")
+    with caplog.at_level(logging.INFO):
+        back = ps.load(tmp_path / "a.ply")
+    assert np.abs(absolute(back) - means).max() < 1e-6  # half a unit in float32
+    assert all(abs(a - b) < 2 for a, b in zip(back.offset, UTM, strict=True))
+    assert caplog.text.count("positions are doubles; their offset") == 1
+    assert torch.equal(back.features_dc, scene.features_dc)
+
+
+def test_doubles_near_the_origin_get_no_offset(tmp_path):
+    scene = cloud(300)
+    with_doubles(scene, tmp_path / "a.ply", origin=(0.0, 0.0, 3.0))
+    back = ps.load(tmp_path / "a.ply")
+    assert back.offset is None and np.allclose(absolute(back), scene.means.numpy() + [0, 0, 3], atol=1e-6)
+
+
+def test_a_render_of_a_geo_referenced_scene_is_that_of_the_scene_at_its_origin(tmp_path):
+    scene = ball(3000, log_size=math.log(0.06))
+    with_doubles(scene, tmp_path / "a.ply")
+    back, views = ps.load(tmp_path / "a.ply"), ps.sample_views(scene, 2, width=96, height=64)
+    wanted, original = ps.render(scene, views), replace(views, viewmats=views.viewmats.double())
+    original = original.relative_to(tuple(-value for value in UTM))
+    got = ps.render(back, original.relative_to(back.offset))
+    rounded = ps.render(back.at_offset(None), original)
+    assert float(ps.psnr(got, wanted).mean()) > 60 > 25 > float(ps.psnr(rounded, wanted).mean())
+
+
+def test_rows_that_are_read_in_pieces_have_the_offset_of_the_whole(tmp_path):
+    with_doubles(cloud(300), tmp_path / "a.ply")
+    whole, rows = ps.load(tmp_path / "a.ply"), PlyRows.open(tmp_path / "a.ply")
+    assert rows.traits == whole.traits
+    assert same_bits(ps.Gaussians.cat([rows.read(0, 100), rows.read(100, 300)]), whole)
+    assert torch.equal(rows.pick([7, 200]).means, whole.means[[7, 200]])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
+def test_files_carry_the_offset(tmp_path, suffix, caplog):
+    scene = cloud(300).replace(offset=UTM)
+    ps.save(scene, tmp_path / f"a{suffix}")
+    back = ps.load(tmp_path / f"a{suffix}")
+    assert back.offset == UTM and not caplog.records
+    assert float(back.means.min()) > -0.1 and float(back.means.max()) < 1.1
+    if suffix == ".ply":
+        assert same_bits(back, scene)
+    if suffix == ".glb":
+        assert torch.equal(back.means, scene.means)
+        data = (tmp_path / "a.glb").read_bytes()
+        node = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])["nodes"][0]
+        assert node["translation"] == [*UTM]
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".splat"])
+def test_files_that_cannot_carry_the_offset_say_so(tmp_path, suffix, caplog):
+    ps.save(cloud(300, sh_degree=0).replace(offset=UTM, features_dc=torch.zeros(300, 3)), tmp_path / f"a{suffix}")
+    text = "the offset 451234.6 5412345.7 312.4 of positions; .glb keeps it"
+    assert caplog.text.count(text) == 1
+
+
+def test_a_small_translation_of_a_node_places_the_scene(tmp_path):
+    ps.save(cloud(30).replace(offset=(0.0, 2.0, 0.5)), tmp_path / "a.glb")
+    back = ps.load(tmp_path / "a.glb")
+    assert back.offset is None
+    assert torch.allclose(back.means, cloud(30).means + torch.tensor([0.0, 2.0, 0.5]), atol=1e-6)
+
+
+@pytest.mark.parametrize("text", ["1 2", "1 2 nan", "1 2 inf", "a b c", "1e300 0 0", ""])
+def test_a_comment_that_is_no_offset_is_named_and_left_out(tmp_path, caplog, text):
+    ps.save(cloud(5).replace(offset=UTM), tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes().replace(b"451234.6 5412345.7 312.4", text.encode())
+    (tmp_path / "a.ply").write_bytes(data)
+    assert ps.load(tmp_path / "a.ply").offset is None
+    assert "no offset of three numbers" in caplog.text or not text
+
+
+@pytest.mark.parametrize("offset", [(1.0, 2.0), (1.0, float("nan"), 0.0)])
+def test_an_offset_that_is_no_point_is_refused(offset):
+    with pytest.raises(ps.SceneError, match="expected three finite numbers"):
+        cloud(3).replace(offset=offset)
+
+
+def test_float32_that_has_lost_its_digits_is_warned_of(tmp_path, caplog):
+    scene = cloud(50)
+    ps.save(scene.replace(means=scene.means + 5e6), tmp_path / "a.ply")
+    ps.load(tmp_path / "a.ply")
+    assert "positions have lost their digits" in caplog.text
+    caplog.clear()
+    ps.save(scene.replace(means=scene.means + 100), tmp_path / "a.ply")
+    ps.load(tmp_path / "a.ply")
+    assert not caplog.records
+
+
+def test_the_offset_survives_pruning_and_picking(tmp_path):
+    scene = ball(400).replace(offset=UTM)
+    assert scene[3].offset == UTM and scene.to(dtype=torch.float64).offset == UTM
+    assert ps.prune(scene, keep="50%", by="opacity").offset == UTM
+    assert ps.prune(scene, keep="50%").offset == UTM
+
+
+def test_turned_and_scaled_scenes_turn_and_scale_their_offset():
+    scene = cloud(40).replace(offset=UTM)
+    moved = ps.place(scene, up="z:y", scale=2.0)
+    x, y, z = absolute(scene).T
+    assert np.allclose(absolute(moved), 2 * np.stack([x, z, -y], axis=1), rtol=0, atol=1e-5)
+
+
+def test_scenes_of_different_offsets_are_joined_in_the_frame_of_the_first():
+    one, other = cloud(10).replace(offset=UTM), cloud(10, 1).replace(offset=(451_230.0, 5_412_340.0, 310.0))
+    both = ps.Gaussians.cat([one, other])
+    assert both.offset == UTM
+    assert np.allclose(absolute(both), np.concatenate([absolute(one), absolute(other)]), rtol=0, atol=1e-6)
+
+
+def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
+    scene = ball(400)
+    with_doubles(scene, tmp_path / "a.ply")
+    views = ps.sample_views(scene, 3, width=96, height=64)
+    cameras = []
+    for index, view in enumerate(views):
+        pose = invert_rigid(view.viewmat.double()[None])[0]
+        cameras.append({
+            "id": index, "img_name": f"{index}", "width": 96, "height": 64,
+            "position": (pose[:3, 3] + torch.tensor(UTM, dtype=torch.float64)).tolist(),
+            "rotation": pose[:3, :3].tolist(), "fx": float(view.K[0, 0]), "fy": float(view.K[1, 1]),
+        })  # fmt: skip
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    dense, given = read_posed(tmp_path / "a.ply", tmp_path / "cameras.json")
+    with torch.no_grad():
+        assert float(ps.psnr(ps.render(dense, given), ps.render(scene, views)).mean()) > 50
+
+
+def test_convert_recentres_and_sets_the_offset(tmp_path, capsys):
+    scene = cloud(200)
+    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "a.ply")
+    main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--recentre"])
+    back = ps.load(tmp_path / "b.ply")
+    assert back.offset == (1000.5, 1000.5, 1000.5) and float(back.means.abs().max()) < 1
+    assert "positions are relative to 1000.5 1000.5 1000.5" in capsys.readouterr().out
+    main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--offset", "0", "0", "0"])
+    back = ps.load(tmp_path / "c.ply")
+    assert back.offset is None and torch.allclose(back.means, scene.means + 1000, atol=1e-4)
+    main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "d.ply"), "--offset", "990", "1000", "-7.5"])
+    assert ps.load(tmp_path / "d.ply").offset == (990.0, 1000.0, -7.5)
+    with pytest.raises(SystemExit):
+        main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "e.ply"), "--recentre", "--offset", "0", "0", "0"])
+    assert "--recentre and --offset both given" in capsys.readouterr().err
+    main(["info", str(tmp_path / "b.ply")])
+    assert "positions are relative to 1000.5 1000.5 1000.5" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("extent", [0.0, 1e-300, 1e-3, 50.0, 1e9])
+def test_offsets_of_any_extent_leave_small_positions(extent):
+    means = np.array(UTM) + extent * np.linspace(-1, 1, 11)[:, None]
+    offset = offset_for(means, np.full((11, 3), -30.0))
+    assert np.abs(means - offset).max() <= 3 * extent + 1e-9
+    assert offset_for(np.full((3, 3), np.nan), np.zeros((3, 3))) is None
