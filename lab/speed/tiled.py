@@ -17,7 +17,7 @@ import tyro
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.ply import header_bytes, ply_bytes, row_table
+from pointsplat_ns.io.ply_writing import header_bytes, ply_bytes, row_table
 from pointsplat_ns.looking.content import content_box
 
 

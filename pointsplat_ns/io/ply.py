@@ -18,21 +18,20 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits, sh_degree_of
-from pointsplat_ns.io.files import keep_usable, logger, one_line, replacing, require_file, require_memory
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset, Traits, sh_degree_of
+from pointsplat_ns.io.files import keep_usable, logger, one_line, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, has_doubles, positions_of, shift_of, with_shift
 from pointsplat_ns.io.ply_dialects import (
     COLORS,
     COLUMNS,
     FILTER,
     attributes_of,
-    columns_of,
     has_plain_colors,
     is_flat,
     with_plain_names,
 )
-from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
-from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
+from pointsplat_ns.io.ply_writing import column_names
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -187,51 +186,6 @@ def _traits(header: Header, vertex: Element, path: Path) -> Traits:
     return traits._replace(antialiased=traits.antialiased or FILTER in {name for name, _ in vertex.properties})
 
 
-def write_ply(scene: Gaussians, path: Path | str) -> None:
-    """Write ``scene`` as a 3DGS PLY: binary little endian, float32, the reference's property order.
-
-    :func:`read_ply` reads a float32 scene back unchanged to the bit. Gaussians that cannot be drawn (NaN, or Inf
-    where it is not valid) are left out, and their number is logged. The write is atomic.
-
-    Raises:
-        SceneError: if ``path`` cannot be written.
-    """
-    scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
-    about = len(scene), scene.sh_degree, scene.traits
-    with replacing(path, ply_bytes(*about)) as part, part.open("wb") as stream:
-        stream.write(header_bytes(*about))
-        for first in range(0, len(scene), CHUNK):
-            stream.write(row_table(scene[first : first + CHUNK]).data)
-
-
-def row_table(scene: Gaussians) -> np.ndarray:
-    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, of a float32 scene on the CPU."""
-    rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
-    values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
-    values += [scene.opacities, scene.scales, scene.quats]
-    return np.ascontiguousarray(torch.cat(values, dim=1).numpy().astype("<f4", copy=False))
-
-
-def header_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> bytes:
-    """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
-    names = _column_names(3 * ((sh_degree + 1) ** 2 - 1))
-    lines = [*first_lines(traits), f"element vertex {count}"]
-    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
-
-
-def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
-    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
-    included) and three for each SH coefficient beyond the constant one, as float32."""
-    return len(header_bytes(count, sh_degree, traits)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
-
-
-def _column_names(rest: int) -> list[str]:
-    """All vertex properties in the order of files, with so many of SH beyond the constant one."""
-    first = [*COLUMNS["means"], *COLUMNS["normals"], *COLUMNS["features_dc"]]
-    last = [*COLUMNS["opacities"], *COLUMNS["scales"], *COLUMNS["quats"]]
-    return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]
-
-
 class _GaussiansAlone(io.FileIO):
     """A PLY file as plyfile reads it, with its header replaced by a checked one that ends with the Gaussians. So
     comments in other encodings and elements after the Gaussians cannot cause errors."""
@@ -310,7 +264,7 @@ def _num_rest(vertex: Element, path: Path) -> int:
         present |= {*COLUMNS["features_dc"]}
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
-    required = _column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
+    required = column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)
     missing = [name for name in required if name not in present and name not in COLUMNS["normals"]]
     if missing:
         others = f" and {len(missing) - 1} more ({', '.join(missing[1:4])}...)" if len(missing) > 1 else ""
@@ -336,9 +290,16 @@ def _scene(
     from numpy.lib.recfunctions import structured_to_unstructured
 
     kinds = rows_of(slice(0, 0)).dtype
-    # Channel-major in the file, channel last in a scene.
-    rest = [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)]
-    columns = columns_of(kinds.names or ()) | {"features_rest": rest}
+    names = kinds.names or ()
+    flat, plain_colors = _is_flat(names), has_plain_colors(names)
+    columns = {
+        **{name: COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
+        # Channel-major in the file, channel last in a scene.
+        "scales": COLUMNS["scales"][: 2 if flat else 3],
+        "features_dc": COLORS if plain_colors else COLUMNS["features_dc"],
+        FILTER: [FILTER] if FILTER in names else [],
+        "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
+    }
     tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
     at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
     # A double beyond float32 becomes Inf and is dropped with the others.

@@ -16,7 +16,8 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.offsets import offset_for
-from pointsplat_ns.io.ply import PlyRows, row_table
+from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.ply_writing import header_bytes, row_table
 
 UTM = (451_234.6, 5_412_345.7, 312.4)
 
@@ -43,8 +44,6 @@ def with_doubles(scene, path, origin=UTM, order="little", ascii_text=False):
 
 
 def ply_lines(scene):
-    from pointsplat_ns.io.ply import header_bytes
-
     return header_bytes(len(scene), scene.sh_degree).decode().splitlines()
 
 

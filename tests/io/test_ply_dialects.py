@@ -10,8 +10,9 @@ import pointsplat_ns as ps
 from making import normal_scene, same_bits
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.discovery import find_scenes
-from pointsplat_ns.io.ply import PlyRows, row_table
+from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_dialects import fuse_filter
+from pointsplat_ns.io.ply_writing import row_table
 
 
 def names_of(degree):

@@ -12,7 +12,7 @@ from making import cloud, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io import ply, read_ply, write_ply
+from pointsplat_ns.io import ply, ply_writing, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of, weights
@@ -109,8 +109,10 @@ def test_a_tolerance_beats_fewer_bits_for_all(tmp_path):
 
 def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
     scene = cloud(50, seed=3, sh_degree=1)
-    table = ply.row_table(scene).astype(">f8")
-    names = [line.split()[2] for line in ply.header_bytes(50, 1).decode().splitlines() if line.startswith("property")]
+    table = ply_writing.row_table(scene).astype(">f8")
+    names = [
+        line.split()[2] for line in ply_writing.header_bytes(50, 1).decode().splitlines() if line.startswith("property")
+    ]
     turned = [names.index(name) for name in reversed(names)]
     lines = ["ply", "format binary_big_endian 1.0", "element camera 2", "property uchar id", "element vertex 50"]
     header = "\n".join([*lines, *(f"property double {names[i]}" for i in turned), "end_header", ""]).encode()

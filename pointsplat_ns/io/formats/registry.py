@@ -36,8 +36,9 @@ from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
 from pointsplat_ns.io.formats.spz import encode_spz, read_spz, rounded_for_spz
 from pointsplat_ns.io.formats.zipped import read_zipped
-from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
+from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.io.ply_header import read_header
+from pointsplat_ns.io.ply_writing import ply_bytes, write_ply
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress
 

@@ -276,8 +276,7 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
 def _position_steps(scene: Gaussians) -> Tensor:
     """Along the axis with the coarsest levels, (N,)."""
     _, mins, maxs = _levels_of(scene)
-    each = torch.from_numpy((maxs - mins) / _LEVELS)
-    return (each * (1 + scene.means.double().abs())).amax(dim=1)
+    return (torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())).amax(dim=1)
 
 
 HOLDS = Holds(

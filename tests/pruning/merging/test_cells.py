@@ -15,7 +15,8 @@ from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
-from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
+from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.ply_writing import header_bytes, row_table
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
@@ -109,7 +110,8 @@ KILLED = """
 from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.pruning.merging import MERGING
-from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
+from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.ply_writing import header_bytes, row_table
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 here = Path(sys.argv[1])
 killed_after_steps(int(sys.argv[2]))
