@@ -290,16 +290,9 @@ def _scene(
     from numpy.lib.recfunctions import structured_to_unstructured
 
     kinds = rows_of(slice(0, 0)).dtype
-    names = kinds.names or ()
-    flat, plain_colors = _is_flat(names), has_plain_colors(names)
-    columns = {
-        **{name: COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")},
-        # Channel-major in the file, channel last in a scene.
-        "scales": COLUMNS["scales"][: 2 if flat else 3],
-        "features_dc": COLORS if plain_colors else COLUMNS["features_dc"],
-        FILTER: [FILTER] if FILTER in names else [],
-        "features_rest": [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)],
-    }
+    # Channel-major in the file, channel last in a scene.
+    rest = [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)]
+    columns = columns_of(kinds.names or ()) | {"features_rest": rest}
     tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
     at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
     # A double beyond float32 becomes Inf and is dropped with the others.

@@ -123,7 +123,7 @@ def stored_path(folder: Path, name: str, content: str, settings: PruneSettings) 
 def write_pruned(path: Path, pruned: Gaussians, dense_count: int, seconds: float) -> None:
     """Write a pruned scene, the number of Gaussians of the dense scene, and the seconds that pruning took."""
     header = {"format": PRUNED_FORMAT, "dense_count": str(dense_count), "seconds": repr(seconds)}
-    header["antialiased"] = str(pruned.antialiased)
+    header |= {"antialiased": str(pruned.antialiased), "traits": json.dumps(pruned.traits)}
     write_tensors(path, dict(pruned.items()), header)
 
 
@@ -143,6 +143,8 @@ def read_pruned(path: Path) -> tuple[Gaussians, int, float]:
                 **{name: file.get_tensor(name) for name in file.keys()},
                 antialiased=header.get("antialiased") == "True",
             )
+            _, up, offset = json.loads(header.get("traits", "[false, null, null]"))
+            pruned = pruned.replace(up=up, offset=None if offset is None else tuple(offset))
             return pruned, int(header["dense_count"]), float(header["seconds"])
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise SceneError(f"{path}: not a readable pruned scene ({one_line(error)}); remove the file") from error
