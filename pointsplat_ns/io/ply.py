@@ -26,6 +26,7 @@ from pointsplat_ns.io.ply_dialects import (
     COLUMNS,
     FILTER,
     attributes_of,
+    columns_of,
     has_plain_colors,
     is_flat,
     with_plain_names,
