@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.ply_header import Header
 
 Table = NDArray[np.float32]
@@ -87,6 +88,9 @@ def _dc_of_colors(colors: Table, kind: np.dtype) -> Table:
     """Constant SH coefficients (N, 3) of red, green and blue (N, 3): whole numbers count in the largest of their type,
     others are in [0, 1]."""
     largest = np.iinfo(kind).max if kind.kind in "iu" else 1
+    top = float(np.nanmax(colors, initial=0)) / largest
+    if top > 1:
+        logger.warning("'red', 'green' and 'blue' are %s up to %g, read as shares of 1; expected at most 1", kind, top)
     return ((colors / np.float32(largest) - np.float32(0.5)) / np.float32(SH_C0)).astype(np.float32)
 
 

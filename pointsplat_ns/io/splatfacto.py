@@ -55,6 +55,8 @@ def read_checkpoint(path: Path | str) -> Gaussians:
         found = open_checkpoint(part)
         antialiased = found.program == "gsplat" and _gsplat_antialiased(part)
         parts.append(_scene_of(found, part).replace(antialiased=antialiased))
+    if found.program == "gsplat" and re.fullmatch(r"ckpt_\d+\.pt", path.name):
+        logger.warning("%s: read as 3D Gaussians; simple_trainer_2dgs.py saves 2D ones under such names, too", path)
     if len({part.sh_degree for part in parts}) > 1:
         raise SceneError(f"{path}: its parts have different SH degrees; expected those of one training")
     if len(parts) > 1:

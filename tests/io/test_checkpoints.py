@@ -61,6 +61,12 @@ def test_the_settings_of_a_training_with_gsplat_say_whether_it_is_drawn_antialia
     assert ps.load(path).antialiased == (settings == "antialiased: true\n")
 
 
+def test_a_name_under_which_gsplat_saves_2d_gaussians_too_is_warned_of(tmp_path, caplog):
+    torch.save({"step": 29999, "splats": splats_of(GOOD)}, tmp_path / "ckpt_29999.pt")
+    assert same_bits(ps.load(tmp_path / "ckpt_29999.pt"), GOOD)
+    assert "read as 3D Gaussians; simple_trainer_2dgs.py saves 2D ones" in caplog.text
+
+
 def test_parts_of_several_gpus_are_one_scene_whichever_is_named(tmp_path):
     scene = normal_scene(9, 2)
     for rank in range(3):

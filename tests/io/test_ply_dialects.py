@@ -76,6 +76,13 @@ def test_colours_as_red_green_and_blue_are_read(tmp_path, kind, text):
     assert same_bits(found.replace(features_dc=scene.features_dc), scene) and found.up == "z"
 
 
+def test_colours_as_floats_beyond_1_are_said(tmp_path, caplog):
+    columns = {name: array for name, array in columns_of(normal_scene(3, 0)).items() if not name.startswith("f_dc")}
+    colors = {name: np.array([0, 128, 255], np.float32) for name in ("red", "green", "blue")}
+    ps.load(write(tmp_path / "a.ply", {**columns, **colors}))
+    assert "'red', 'green' and 'blue' are float32 up to 255, read as shares of 1" in caplog.text
+
+
 def test_points_with_colours_are_no_gaussians(tmp_path):
     columns = {name: np.zeros(3, np.float32) for name in "xyz"}
     columns |= {name: np.zeros(3, np.uint8) for name in ("red", "green", "blue")}

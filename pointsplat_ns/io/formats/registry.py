@@ -212,7 +212,7 @@ def format_to_write(path: Path | str) -> Format:
 
 def format_like(path: Path) -> Format:
     """The format to write what is made of a scene: that of the scene's file if it can be written, else PLY."""
-    if not path.is_dir():
+    if path.is_file():
         with suppress(SceneError):  # one that cannot be read, which its reader says
             kind = format_to_read(path)
             if kind is not None and kind.write is not None and kind.suffix.startswith("."):
