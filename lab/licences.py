@@ -2,9 +2,9 @@
 
     python -m lab.licences        # in a fresh environment with pointsplat-ns[nerfstudio]
 
-Read from the metadata of what is installed, or where that has none from its licence file: it runs nothing and needs no
-network. What packages bundle stands in no
-metadata; of that, the GPL's codecs are found by the names of their files.
+Read from the metadata of what is installed, or where that has none from its licence file: nothing is run, and no
+network is needed. What packages bundle stands in no metadata; of that, the GPL's codecs are found by the names of their
+files.
 """
 
 from __future__ import annotations

@@ -16,11 +16,13 @@ nothing.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+TYPE_CHECKING = False  # as type checkers read it; to import typing takes longer than all the rest here
 if TYPE_CHECKING:
+    from typing import Any
+
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
     from pointsplat_ns.compression.compact import Compacted
     from pointsplat_ns.compression.levels import Levels

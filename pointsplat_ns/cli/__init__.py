@@ -156,6 +156,19 @@ def _is_bug(error: Exception) -> bool:
     return not isinstance(error, torch.cuda.OutOfMemoryError) and "can't allocate memory" not in str(error)
 
 
+def _ignore_matplotlibrc() -> None:
+    """Keep matplotlib from obeying a file ``matplotlibrc`` in the current folder, which may be a stranger's, before the
+    user's own. It looks for one when it is imported, so that is done elsewhere."""
+    if not os.path.lexists("matplotlibrc"):
+        return
+    here = os.getcwd()
+    os.chdir(os.sep)
+    try:
+        import matplotlib  # noqa: F401
+    finally:
+        os.chdir(here)
+
+
 def _command(name: str) -> Callable[..., None]:
     """The function of a command, in the module of the same name."""
     name = name.replace("-", "_")
@@ -244,9 +257,12 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns.cli.help import after_help
         from pointsplat_ns.cli.printing import only_json
         from pointsplat_ns.cli.scene_options import claims_until_the_end, quantities
-        from pointsplat_ns.system.memory import keep_freed_memory
+        from pointsplat_ns.system.memory import keep_freed_memory, require_room_for_torch
 
+        if not {"--version", "--help", "-h"} & {*args}:
+            require_room_for_torch()
         keep_freed_memory()
+        _ignore_matplotlibrc()
         level = logging.DEBUG if "--verbose" in args else logging.INFO
         with _log_printed(level), _ended_by_signals(), only_json(args), claims_until_the_end(), quantities():
             if args == ["--version"]:

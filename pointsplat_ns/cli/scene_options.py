@@ -164,14 +164,29 @@ Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 
 
 def quantities() -> ConstructorRegistry:
-    """A context in which tyro reads numbers as :func:`~pointsplat_ns.system.quantities.parse_number` does."""
+    """A context in which tyro reads numbers as :func:`~pointsplat_ns.system.quantities.parse_number` does, and refuses
+    empty paths, which would be the current folder: those of a script whose variable is not set."""
     registry, rules = ConstructorRegistry(), {int: _spec("INT", parse_count), float: _spec("FLOAT", _float)}
 
+    path = PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: _path(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    )
+
     @registry.primitive_rule
-    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        return rules.get(info.type)
+    def number_or_path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        return path if info.type is Path else rules.get(info.type)
 
     return registry
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise ValueError("an empty path; expected a name, or . for the current folder")
+    return Path(text)
 
 
 def _float(text: str) -> float:

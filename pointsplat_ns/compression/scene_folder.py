@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
 import functools
 import json
@@ -24,6 +23,7 @@ from pointsplat_ns.compression.scene_task import (
     remove_unfinished,
 )
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import logger, read_text, replacing
 from pointsplat_ns.io.formats import format_like
@@ -229,10 +229,4 @@ def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping
     """Write the table of all scenes. Scenes of other shards are taken from their records."""
     with claim(output / FOLDER_FILES.scenes_lock, wait=True):  # so the last process to write has read all records
         rows = [results.get(task.name) or known_result(task) for task in everything]
-        with (
-            replacing(output / FOLDER_FILES.scenes_table) as part,
-            part.open("w", encoding="utf-8", newline="") as stream,
-        ):
-            writer = csv.DictWriter(stream, [field.name for field in dataclasses.fields(SceneResult)])
-            writer.writeheader()
-            writer.writerows(map(dataclasses.asdict, rows))
+        write_csv([dataclasses.asdict(row) for row in rows], output / FOLDER_FILES.scenes_table)

@@ -194,11 +194,13 @@ def target_of(path: Path) -> Path:
     """The file that is written for ``path``: the target of a symbolic link, else ``path`` itself.
 
     Raises:
-        SceneError: if it is a folder, a device or a pipe, or no name of a file.
+        SceneError: if it is a folder, a device or a pipe, a link to what is not there, or no name of a file.
     """
     if "\0" in str(path):
         raise SceneError(f"{str(path)!r}: holds a NUL character; expected the name of a file to write")
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if target != path and not os.path.lexists(target):  # whoever made the link may want a file to appear there
+        raise SceneError(f"{path}: a link to {target}, where nothing is; remove it, or name that file")
     if target.is_dir():
         raise SceneError(f"{path}: is a folder; expected the name of a file to write")
     _mode_of(target)

@@ -45,6 +45,7 @@ class _Backbone:
     channels: tuple[int, ...]  # of those outputs
     minimum: int  # image side below which the last of them is empty
     files: tuple[str, ...]  # usual file names; the last is torchvision's own
+    digest: str  # SHA-256 of torchvision's file, of which its name has the first 8 digits
 
 
 _BACKBONES: dict[str, _Backbone] = {
@@ -53,12 +54,14 @@ _BACKBONES: dict[str, _Backbone] = {
         channels=(64, 192, 384, 256, 256),
         minimum=31,
         files=("alexnet_features.pth", "alexnet-owt-7be5be79.pth"),
+        digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
     ),
     "vgg": _Backbone(
         taps=(3, 8, 15, 22, 29),
         channels=(64, 128, 256, 512, 512),
         minimum=16,
         files=("vgg16_features.pth", "vgg16-397923af.pth"),
+        digest="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
     ),
 }
 
@@ -287,7 +290,7 @@ def _linear_file(net: Net) -> Path:
 
 
 def _download(net: Net, target: Path, allowed: bool) -> None:
-    """Download torchvision's file into torch hub's cache, atomically."""
+    """Download torchvision's file into torch hub's cache, atomically. A file with another SHA-256 is not kept."""
     remedy = f"set {WEIGHTS_VARIABLE} to a folder with {' or '.join(_BACKBONES[net].files)}"
     if not allowed:
         raise LpipsUnavailable(f"{target}: LPIPS's {net} backbone is not there; {remedy}")
@@ -296,7 +299,7 @@ def _download(net: Net, target: Path, allowed: bool) -> None:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         url = f"https://download.pytorch.org/models/{target.name}"
-        torch.hub.download_url_to_file(url, str(target), target.stem.split("-")[-1], progress=False)
+        torch.hub.download_url_to_file(url, str(target), _BACKBONES[net].digest, progress=False)
     except Exception as error:  # no route, no name, a proxy's page, a full disk: all mean no LPIPS
         reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
         why = (str(reason).splitlines() or [type(error).__name__])[0][:100]

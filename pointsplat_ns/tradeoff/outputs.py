@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
 from pointsplat_ns.system.progress import Progress, silent
@@ -49,11 +49,7 @@ def write_outputs(sweep: Tradeoff, folder: Path, progress: Progress = silent) ->
     dense = sweep.points[0]
     points = [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
     write_json({**dataclasses.asdict(sweep), "points": points}, folder / SWEEP_FILES.json)
-    rows = [_row(point, dense) for point in sweep.points]
-    with replacing(folder / SWEEP_FILES.table) as part, part.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv([_row(point, dense) for point in sweep.points], folder / SWEEP_FILES.table)
     for cost, name in SWEEP_FILES.plots.items():
         plot(sweep, cost, folder / name)
     write_sweep_page(sweep, folder, folder / SWEEP_FILES.page, progress)

@@ -54,7 +54,7 @@ def pointsplat(folder: Path, words: str) -> subprocess.CompletedProcess[str]:
     script = folder.parent / "bin" / "pointsplat"
     script.parent.mkdir(exist_ok=True)
     script.write_text(
-        f"#!{sys.executable}\nfrom pointsplat_ns.cli import program\nif __name__ == '__main__':\n    program()\n"
+        f"#!{sys.executable}\nfrom pointsplat_ns.start import program\nif __name__ == '__main__':\n    program()\n"
     )
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "POINTSPLAT_CACHE": str(folder.parent / "cache")}
@@ -69,6 +69,14 @@ def test_nothing_in_the_current_folder_is_imported_or_run(words, planted):
     assert done.returncode == 0, done.stderr
     log = planted.parent / "log"
     assert not log.exists(), sorted(set(log.read_text().splitlines()))
+
+
+def test_a_matplotlibrc_of_the_current_folder_is_not_obeyed(planted):
+    words = "prune scenes/1.ply --keep 4 --by paper --dry-run --plot {}.png"
+    assert pointsplat(planted, words.format("before")).returncode == 0
+    (planted / "matplotlibrc").write_text("figure.facecolor: red\nsavefig.facecolor: red\nlines.linewidth: 9\n")
+    assert pointsplat(planted, words.format("after")).returncode == 0
+    assert (planted / "before.png").read_bytes() == (planted / "after.png").read_bytes()
 
 
 def test_splat_transform_of_the_current_folder_is_not_run(planted, monkeypatch):
@@ -96,7 +104,8 @@ def test_each_place_that_starts_processes_is_known():
                 found.add(str(path.relative_to(REPOSITORY / "pointsplat_ns")))
     assert found == {
         "nerfstudio_plugin/running.py",  # ns-train and ns-eval, beside this Python
-        "system/kernels.py",  # a compiler on PATH
+        "system/memory.py",  # Python itself, with the same path
+        "system/native_libraries.py",  # a compiler on PATH
         "system/programs.py",  # a program in an isolated Python
         "system/workers.py",  # Python itself, without the current folder on its path
         "tables/making.py",  # splat-transform on PATH

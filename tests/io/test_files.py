@@ -49,9 +49,16 @@ def test_output_through_a_link_is_written_to_its_target(tmp_path, relative):
     write(link)
     assert link.is_symlink() and target.read_text() == "new"
     assert [path.name for path in target.parent.iterdir()] == ["a.ply"]
-    target.unlink()
-    write(link, "anew")
-    assert link.is_symlink() and target.read_text() == "anew", "a link that led nowhere"
+
+
+@pytest.mark.parametrize("target", ["gone.ply", "missing/gone.ply", "link.ply"])
+def test_a_link_that_leads_nowhere_is_refused_and_makes_no_file(target, tmp_path):
+    """Whoever made it may want a file to appear there, such as one that a shell runs."""
+    link = tmp_path / "link.ply"
+    link.symlink_to(target)
+    with pytest.raises(SceneError, match="link.ply: (a link to .*, where nothing is; remove it|not a regular file)"):
+        write(link)
+    assert [*tmp_path.iterdir()] == [link] and link.is_symlink()
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o755])

@@ -1,9 +1,12 @@
 """LPIPS against torchmetrics' own, where its weights come from, and how it says that there are none."""
 
+import hashlib
 import math
 import os
+import re
 import socket
 import urllib.error
+from dataclasses import replace
 from io import BytesIO
 
 import cachetools
@@ -212,6 +215,29 @@ def test_a_wrong_or_cut_download_leaves_no_file_and_restores_the_timeout(tmp_pat
     with pytest.raises(LpipsUnavailable, match=message):
         load_lpips("alex")
     assert not files_below(tmp_path) and socket.getdefaulttimeout() is None
+
+
+def test_a_download_is_kept_only_with_all_digits_of_its_sha_256(alex_file, tmp_path, monkeypatch):
+    """Eight of them, as in its name, can be had by trying."""
+    data = alex_file.read_bytes()
+    right = hashlib.sha256(data).hexdigest()
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub home"))
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    for digest in (right[:-1] + "0123456789abcdef"[int(right[-1], 16) ^ 1], right):
+        monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Answer(data))
+        monkeypatch.setitem(lpips._BACKBONES, "alex", replace(lpips._BACKBONES["alex"], digest=digest))
+        if digest == right:
+            load_lpips("alex")
+        else:
+            with pytest.raises(LpipsUnavailable, match="invalid hash value"):
+                load_lpips("alex")
+            assert not files_below(tmp_path / "hub home")
+
+
+def test_the_digests_are_those_that_the_names_of_the_files_begin():
+    for backbone in lpips._BACKBONES.values():
+        assert re.fullmatch("[0-9a-f]{64}", backbone.digest)
+        assert backbone.files[-1].endswith(f"-{backbone.digest[:8]}.pth")
 
 
 @pytest.mark.parametrize(

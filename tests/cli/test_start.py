@@ -1,0 +1,70 @@
+"""The first moments of the program."""
+
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from pointsplat_ns.cli import main
+
+INTERRUPTED = """
+import sys
+class Interrupt:
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            raise KeyboardInterrupt  # as Ctrl-C does between any two instructions
+sys.meta_path.insert(0, Interrupt())
+for name in [name for name in sys.modules if name == sys.argv[1]]:
+    del sys.modules[name]
+from pointsplat_ns.start import program
+sys.argv[1:] = ["info", "room.ply"]
+program()
+"""
+
+
+@pytest.mark.parametrize("name", ["pointsplat_ns.cli", "inspect", "logging", "tyro", "pointsplat_ns.cli.info", "torch"])
+def test_ctrl_c_while_the_program_is_imported_is_one_word(name):
+    words = INTERRUPTED.replace("sys.argv[1]:", f"{name!r}:").replace("sys.argv[1]]", f"{name!r}]")
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
+    code = "import sys; before = {*sys.modules}; import pointsplat_ns.start; print(*sorted({*sys.modules} - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    by_python = {"importlib", "importlib._bootstrap", "importlib._bootstrap_external", "warnings"}
+    assert {*done.stdout.split()} - by_python == {"pointsplat_ns", "pointsplat_ns.start"}
+
+
+@pytest.mark.parametrize("gigabytes", [0.5, 1.5, 2.5])
+def test_too_little_address_space_for_torch_is_one_line(gigabytes):
+    """The import of torch ends in a traceback or, with more of it, is aborted."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (int(gigabytes * 1e9), int(gigabytes * 1e9)))
+
+    words = [sys.executable, "-c", "from pointsplat_ns.start import program; program()", "info", "room.ply"]
+    done = subprocess.run(words, capture_output=True, text=True, preexec_fn=limit)
+    if "no such file" in done.stderr:
+        pytest.skip("this build of torch takes less")
+    said = f"torch cannot be loaded in {gigabytes} GB of address space (ulimit -v); expected 4 GB or more, or no limit"
+    assert (done.returncode, done.stderr) == (1, f"error: {said}\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["prune", ""], ["prune", "a.ply", "-o", ""], ["info", "a.ply", ""], ["convert", "a.ply", ""], ["view", ""],
+        ["compact", "", "--keep", "10%"], ["render", "a.ply", "-o", ""], ["export", "", "-o", "a.ply"], ["lod", ""],
+        ["tradeoff", ""], ["train", ""], ["report", ""], ["tables", "", "-o", "t"], ["rooms", "-o", ""],
+        ["demo", "--output", ""],
+        ["make-refiner", "-o", ""], ["make-feedback", ""], ["prune", "a.ply", "--poses", ""],
+    ],
+)  # fmt: skip
+def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2 and "parsing" in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
