@@ -137,7 +137,7 @@ def scenes(draw):
     """Scenes of up to five Gaussians of any degree, in which any number may be extreme."""
     n, degree = draw(st.integers(0, 5)), draw(st.integers(0, 3))
     tails = ((3,), (3,), (4,), (1,), (3,), ((degree + 1) ** 2 - 1, 3))
-    tables = (draw(arrays.arrays(np.float32, (n, *tail), elements=NUMBERS.map(np.float32))) for tail in tails)
+    tables = (draw(arrays.arrays(np.float64, (n, *tail), elements=NUMBERS)).astype(np.float32) for tail in tails)
     return ps.Gaussians(*(torch.from_numpy(table) for table in tables))
 
 
