@@ -104,7 +104,7 @@ def find_junk(scene: Gaussians, progress: Progress = silent) -> Junk:
 def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
     """Whether each Gaussian (N,) has a blend weight on any pixel of any view."""
     has_pixels = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-    for done, pixels in enumerate(each_view(list(views), len(scene), lambda view: pixels_of(scene, view))):
+    for done, pixels in enumerate(each_view(scene, views, pixels_of)):
         has_pixels |= pixels > 0
         progress("looking for unseen Gaussians", (done + 1) / len(views))
     return has_pixels

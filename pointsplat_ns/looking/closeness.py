@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -131,7 +130,7 @@ class DenseReference(Reference):
 
 def _drawn(scene: Gaussians, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
     """Image (H, W, 3) and alpha (H, W, 1) of each view."""
-    return each_view(list(views), len(scene), partial(render_with_alpha, scene))
+    return each_view(scene, views, render_with_alpha)
 
 
 def views_text(count: int) -> str:

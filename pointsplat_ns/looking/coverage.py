@@ -45,7 +45,7 @@ def coverage(
 
     def views_that_show(views: Views) -> Tensor:  # number (N,) int64 for each Gaussian
         counts = torch.zeros(len(scene), **INDICES)
-        for pixels in each_view(list(views.resized(side)), len(scene), lambda view: pixels_of(scene, view)):
+        for pixels in each_view(scene, views.resized(side), pixels_of):
             counts += pixels >= min_pixels
         return counts
 

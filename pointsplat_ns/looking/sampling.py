@@ -98,7 +98,8 @@ class Sampler:
     ):
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
-        self.scene, self._count = thinned(scene.detach(), settings.sampled_count), len(scene)
+        self.scene = thinned(scene.detach(), settings.sampled_count).to("cpu")  # many small operations
+        self._count = len(scene)
         self.resolution, self.settings, self._up = resolution, settings, known_up(up, scene)
 
     @cached_property

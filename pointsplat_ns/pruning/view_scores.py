@@ -130,7 +130,8 @@ def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
     ok = (diagonal > 0).all(-1) & blocks.isfinite().all(-1).all(-1)
     root = torch.where(ok[:, None], diagonal, 1.0).sqrt()
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1], **FLOATS).to(blocks))
-    values = torch.linalg.eigvalsh(unit / root[:, :, None] / root[:, None, :])
+    # on the CPU: what torch's linear algebra on a GPU is made of differs between machines
+    values = torch.linalg.eigvalsh((unit / root[:, :, None] / root[:, None, :]).cpu()).to(root.device)
     result = values.clamp_min(least).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
 
@@ -187,8 +188,8 @@ def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index:
         scene.quats.detach(),
         stds,
         scene.alphas.detach(),
-        views.viewmats[index].to(means.device),
-        views.Ks[index].to(means),
+        views.viewmats[index],
+        views.Ks[index],
         views.width,
         views.height,
         near_plane=views.near_plane,

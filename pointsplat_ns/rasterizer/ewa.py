@@ -135,15 +135,18 @@ def _shape(slopes: Tensor, rz: Tensor, quats: Tensor, scales: Tensor, view: Tens
 
 
 class Project(torch.autograd.Function):
-    """Project what one camera sees; see :func:`projection.project`."""
+    """Project what one camera sees; see :func:`projection.project`. The camera's rotation and centre, and the gradients
+    by them, are on the CPU in float64, whatever the device of the Gaussians."""
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, view, centre, lens: Lens):
-        wide, view = view, view.to(means.dtype)
         # the centre in two parts: at 1e6 from the origin float32 alone would move the camera by 0.03 units
         near_centre = centre.to(means.dtype)
         remainder = (centre - near_centre).to(means.dtype)
-        points = torch.addmm(-(view @ remainder)[:, None], view, (means - near_centre).T)  # (3, N)
+        offset = -(view.to(means.dtype) @ remainder)[:, None].to(means.device)
+        wide, centre, near_centre = (values.to(means.device) for values in (view, centre, near_centre))
+        view = wide.to(means.dtype)
+        points = torch.addmm(offset, view, (means - near_centre).T)  # (3, N)
         ids = _candidates(points, scales, opacities, lens)
 
         # The candidates, in float64: far from the camera, x and y are small sums of large products, and depths differ
@@ -250,8 +253,9 @@ class Project(torch.autograd.Function):
             tx, ty = slopes[0].clamp(low_x, high_x), slopes[1].clamp(low_y, high_y)
             grad_view = grad_points @ directions
             grad_view += torch.stack([grad_a.sum(1), grad_b.sum(1), -(grad_a @ tx) - (grad_b @ ty)])
+            grad_view = grad_view.to(device="cpu", dtype=torch.float64)
         if ctx.needs_input_grad[5]:
-            grad_centre = -grad_directions.sum(0, dtype=torch.float64)
+            grad_centre = -grad_directions.sum(0, dtype=torch.float64).cpu()
 
         # a unit quaternion has no gradient along itself
         grad_unit = grad_unit - unit * (unit * grad_unit).sum(0)

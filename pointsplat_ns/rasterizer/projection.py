@@ -41,13 +41,13 @@ class Projected:
 
 
 def camera_centre(viewmat: Tensor) -> Tensor:
-    """Position of the camera in the world, (3,), in float64: the solution of ``R c = -t``.
+    """Position of the camera in the world, (3,), of a matrix (4, 4) on the CPU in float64: the solution of
+    ``R c = -t``.
 
     Solved rather than ``-R^T t``: a rotation stored in float32 is orthogonal to 1e-7 only, which a translation of 1e6
     turns into a tenth of a unit. Raises ValueError if the matrix is not finite, its rotation cannot be inverted, or its
     last row is not 0, 0, 0, 1.
     """
-    viewmat = viewmat.double()
     rows = viewmat.tolist()
     if not all(math.isfinite(value) for row in rows for value in row) or torch.linalg.det(viewmat[:3, :3]) == 0:
         raise ValueError(f"viewmat is {rows}; expected finite numbers and a rotation")
@@ -95,12 +95,21 @@ def drawn_antialiased(scene: Gaussians, view: View | Views) -> bool:
 
 def project_scene(scene: Gaussians, view: View) -> Projected:
     """Projection of a scene to a view, as in :func:`~pointsplat_ns.render`, on the scene's device."""
-    viewmat = view.viewmat.to(scene.device)  # float32 would move a camera that is far from the origin
     return project(
-        scene.means, scene.quats, scene.stds, scene.alphas, viewmat, view.K.to(scene.means), view.width, view.height,
+        scene.means, scene.quats, scene.stds, scene.alphas, view.viewmat, view.K, view.width, view.height,
         near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
         antialiased=drawn_antialiased(scene, view),
     )  # fmt: skip
+
+
+def on_cpu(camera: Tensor) -> Tensor:
+    """Matrices of cameras on the CPU in float64, where their few numbers are computed with; the gradient returns to
+    the device that they came from.
+
+    float32 would move a camera that is far from the origin. On a GPU each number that Python looks at would wait for
+    all that was drawn before, and torch's linear algebra must not be called there first from several threads at once.
+    """
+    return camera.to(device="cpu", dtype=torch.float64)
 
 
 def camera_of(
@@ -114,8 +123,9 @@ def camera_of(
     eps2d: float,
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Lens]:
-    """Rotation (3, 3) and centre (3,) of a camera, float64, and its intrinsics. Arguments and errors are those of
-    :func:`project`."""
+    """Rotation (3, 3) and centre (3,) of a camera, on the CPU in float64, and its intrinsics. Arguments and errors are
+    those of :func:`project`."""
+    viewmat, K = on_cpu(viewmat), on_cpu(K)
     # R (m - c) and not R m + t: far from the origin the first rounds alike for all Gaussians
     centre = camera_centre(viewmat)
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
@@ -124,7 +134,7 @@ def camera_of(
     if not _close((skew, below, *last), (0.0, 0.0, 0.0, 0.0, 1.0)):
         raise ValueError(f"K is {K.tolist()}; expected no skew: zeros but for fx, fy, cx, cy and the 1 of the last row")
     lens = Lens(fx, fy, cx, cy, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    return viewmat[:3, :3].double(), centre, lens
+    return viewmat[:3, :3], centre, lens
 
 
 def project(
@@ -132,8 +142,8 @@ def project(
     quats: Tensor,  # [N, 4] wxyz, any length
     scales: Tensor,  # [N, 3] standard deviations
     opacities: Tensor,  # [N] in [0, 1]
-    viewmat: Tensor,  # [4, 4] world to camera, OpenCV axes
-    K: Tensor,  # [3, 3]
+    viewmat: Tensor,  # [4, 4] world to camera, OpenCV axes; on any device
+    K: Tensor,  # [3, 3]; on any device
     width: int,
     height: int,
     near_plane: float = 0.01,

@@ -15,7 +15,7 @@ from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.constants import QUALITIES, TILE, Quality
 from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
 from pointsplat_ns.rasterizer.precision import full_precision
-from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, project
+from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, on_cpu, project
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.views import EPS2D
 
@@ -61,8 +61,8 @@ def rasterization(
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N] or [N, 1]
     colors: Colors,  # [(C,) N, D] or [(C,) N, K, 3], or [N, 3] and [N, K - 1, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
+    viewmats: Tensor,  # [C, 4, 4], on any device
+    Ks: Tensor,  # [C, 3, 3], on any device
     width: int,
     height: int,
     near_plane: float = 0.01,
@@ -88,7 +88,8 @@ def rasterization(
     Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
     quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
     they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
-    place the camera exactly, however far from the origin.
+    place the camera exactly, however far from the origin. Cameras are best given on the CPU, where they are computed
+    with in float64: those on a GPU are fetched from it, which waits for all that it has to do.
 
     Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian, an opacity
     of 1 opaque. Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
@@ -172,6 +173,7 @@ def rasterization(
     means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
+    viewmats, Ks = on_cpu(viewmats), on_cpu(Ks)
     per_camera = isinstance(colors, Tensor) and colors.dim() == (4 if sh_degree is not None else 3)
 
     seen = [

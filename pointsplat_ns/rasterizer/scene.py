@@ -83,7 +83,7 @@ def _over(image: Tensor, alpha: Tensor, view: View) -> Tensor:
 
 def _camera(scene: Gaussians, view: View) -> pictures.Camera:
     return camera_of(
-        view.viewmat, view.K.to(scene.means), view.width, view.height, view.near_plane, math.inf, 0.0, view.eps2d,
+        view.viewmat, view.K, view.width, view.height, view.near_plane, math.inf, 0.0, view.eps2d,
         drawn_antialiased(scene, view),
     )  # fmt: skip
 
@@ -97,8 +97,8 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         scales=scene.stds,
         opacities=_alphas(scene),
         colors=colors,
-        viewmats=view.viewmat[None].to(scene.device),  # float32 would move a camera that is far from the origin
-        Ks=view.K[None].to(scene.means),
+        viewmats=view.viewmat[None],
+        Ks=view.K[None],
         width=view.width,
         height=view.height,
         near_plane=view.near_plane,

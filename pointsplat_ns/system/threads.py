@@ -76,13 +76,15 @@ def one_thread_each() -> Iterator[None]:
         chosen.most, chosen.fixed = outer
 
 
-def in_threads(function: Callable[[Item], object], items: Sequence[Item]) -> None:
-    """Call a function with each item, on :func:`most_threads` threads; torch uses one thread inside each.
+def in_threads(function: Callable[[Item], object], items: Sequence[Item], device: torch.device) -> None:
+    """Call a function with each item: on a CPU on :func:`most_threads` threads, torch using one inside each; for a GPU
+    in this thread, as a GPU runs one operation of a process after the other, and not all of torch may be called there
+    from several threads.
 
     One operation on a small piece that stays in the cache is faster on one thread than shared between several, which
     wait for one another. Calls must not depend on each other.
     """
-    count = min(most_threads(), len(items))
+    count = min(most_threads(), len(items)) if device.type == "cpu" else 1
     if count <= 1:
         for item in items:
             function(item)

@@ -220,7 +220,7 @@ class PointSplatModel(SplatfactoModel):
             opacities=gaussians.alphas,
             colors=(gaussians.features_dc, gaussians.features_rest),
             viewmats=viewmats_from_opengl(camera.camera_to_worlds),
-            Ks=camera.get_intrinsics_matrices().to(self.device),
+            Ks=camera.get_intrinsics_matrices(),
             width=width,
             height=height,
             near_plane=near_plane_of(camera),

@@ -100,7 +100,7 @@ def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
         mine = costs[me].where(~both, mean.where(others > me[:, None], math.inf))
         result[me] = mine.where(others != me[:, None], math.inf).nan_to_num(nan=math.inf, posinf=math.inf)
 
-    in_threads(fill, torch.arange(len(near), **INDICES).split(CHUNK))
+    in_threads(fill, torch.arange(len(near), **INDICES).split(CHUNK), near.device)
     return result
 
 

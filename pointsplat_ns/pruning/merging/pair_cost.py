@@ -83,7 +83,7 @@ def pair_costs(
     def choose(rows: Tensor) -> None:
         directions[rows] = directions_of(state, rows).to(torch.uint8)
 
-    in_threads(choose, everyone)
+    in_threads(choose, everyone, near.device)
     projections = Projections.empty(state, dtype)
     costs = torch.zeros(near.shape, dtype=dtype, device="cpu")
     for direction in range(len(DIRECTIONS)):
@@ -97,8 +97,8 @@ def pair_costs(
         def add(rows: Tensor) -> None:
             costs[rows] += costs_in_plane(projections, rows, near[rows], settings)
 
-        in_threads(fill, everyone)
-        in_threads(add, compared.split(GAUSSIANS_AT_ONCE))
+        in_threads(fill, everyone, near.device)
+        in_threads(add, compared.split(GAUSSIANS_AT_ONCE), near.device)
     return costs.mul_(state.weights[:, None])
 
 

@@ -61,7 +61,7 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     covered = torch.zeros(len(scene), **DOUBLES)
     small = views.spread(settings.visibility_views).resized(settings.visibility_side)
     small = replace(small, rasterize_mode="antialiased")
-    for pixels in each_view(list(small), len(scene), lambda view: pixels_of(scene, view)):
+    for pixels in each_view(scene, small, pixels_of):
         covered += pixels
     stds = scene.stds[rows].double().sort(dim=1).values
     area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)

@@ -1,0 +1,134 @@
+"""What is computed where, by a GPU that is pretended: nothing on it from several threads, no linear algebra of a few
+numbers, and the same results as on the CPU."""
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import box_room, same
+from pointsplat_ns.compression import trained_refiner
+from pointsplat_ns.compression.repair import STEPS
+from pointsplat_ns.looking.each_view import each_view
+from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.system.threads import fixed_threads
+from pretend_gpu import GPU, pretend_gpu
+
+NEAR = 1e-4
+"""Difference of colours in [0, 1] in float32 between compiled kernels, which the CPU uses, and torch."""
+
+
+@pytest.fixture(autouse=True)
+def several_threads():
+    """More than one thread for pieces of work, whatever the environment says."""
+    with fixed_threads(4):
+        yield
+
+
+@pytest.fixture(scope="module")
+def room():
+    return box_room(0, count=400, size=0.1)
+
+
+@pytest.fixture(scope="module")
+def views(room):
+    return ps.sample_views(room, 3, width=48, height=36)
+
+
+def check(gpu) -> None:
+    """Fail if a GPU would have been called from several threads, or its linear algebra loaded."""
+    assert gpu.operations and not gpu.from_other_threads() and not gpu.linear_algebra()
+
+
+def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_devices(room):
+    with pretend_gpu() as gpu:
+        means = room.means.to(GPU)
+        with pytest.raises(RuntimeError, match="expected one device"):
+            means @ torch.eye(3)
+        torch.linalg.det(means[:9].view(3, 3, 3))
+        assert gpu.linear_algebra()
+        assert not gpu.from_other_threads()
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(means.square).result()
+        assert gpu.from_other_threads() == {"aten.pow.Tensor_Scalar"}
+
+
+def test_several_views_of_a_scene_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
+    on_cpu = ps.render(room, views)
+    with pretend_gpu() as gpu:
+        drawn = torch.stack(list(each_view(room.to(GPU), views, ps.render))).cpu()
+    check(gpu)
+    torch.testing.assert_close(drawn, on_cpu, atol=NEAR, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("cameras_on", ["cpu", GPU])
+def test_gradients_reach_a_viewmat_on_any_device(room, views, cameras_on, dtype):
+    def gradients(device, cameras_on):
+        scene = room.to(device=device, dtype=dtype)
+        leaves = [value.requires_grad_() for value in (scene.means, scene.quats, scene.stds, scene.alphas, scene.sh)]
+        viewmats = views.viewmats.to(device=cameras_on, dtype=dtype).requires_grad_()
+        image, _, _ = ps.rasterization(
+            *leaves, viewmats, views.Ks.to(device=cameras_on, dtype=dtype), views.width, views.height,
+            sh_degree=scene.sh_degree, compiled=False,
+        )  # fmt: skip
+        found = torch.autograd.grad(image.square().mean(), [*leaves, viewmats])
+        assert found[-1].device == viewmats.device and found[-1].dtype == dtype
+        return [value.cpu() for value in found]
+
+    wanted = gradients("cpu", "cpu")
+    with pretend_gpu() as gpu:
+        found = gradients(GPU, cameras_on)
+    check(gpu)
+    assert all(bool(value.any()) for value in wanted)
+    for ours, right in zip(found, wanted, strict=True):
+        torch.testing.assert_close(ours, right, atol=1e-6 * float(right.abs().max()), rtol=1e-4)
+
+
+@pytest.mark.parametrize("by", METHODS)
+def test_every_method_keeps_the_same_gaussians_on_a_gpu(by, room, views):
+    given = views if METHODS[by].needs_views else None
+    wanted = ps.prune(room, 0.3, by=by, views=given)
+    with pretend_gpu() as gpu:
+        kept = ps.prune(room.to(GPU), 0.3, by=by, views=given)
+        assert kept.device == GPU
+        kept = kept.to("cpu")
+    check(gpu)
+    assert same(kept, wanted)
+
+
+def test_views_are_sampled_of_a_scene_on_a_gpu_as_on_the_cpu(room, views):
+    with pretend_gpu() as gpu:
+        found = ps.sample_views(room.to(GPU), 3, width=48, height=36)
+    check(gpu)
+    assert torch.equal(found.viewmats, views.viewmats) and torch.equal(found.Ks, views.Ks)
+
+
+@pytest.fixture
+def computed_there(monkeypatch):
+    """What chooses a GPU where there is one chooses the pretended one; repairs take few steps."""
+    monkeypatch.setattr("pointsplat_ns.compression.requests.default_device", lambda: GPU)
+    monkeypatch.setattr(trained_refiner, "default_device", lambda: GPU)
+    monkeypatch.setitem(STEPS, "quick", 3)
+
+
+def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, monkeypatch, request):
+    monkeypatch.setitem(STEPS, "quick", 3)
+    wanted = ps.compact(room, 0.3, resolution=(64, 48))
+    request.getfixturevalue("computed_there")
+    with pretend_gpu() as gpu:
+        found = ps.compact(room, 0.3, resolution=(64, 48))
+    check(gpu)
+    assert len(gpu.operations) > 1000, "renders, and steps of the repair"
+    assert len(found.scene) == len(wanted.scene)
+    for ours, right in zip(found.stages, wanted.stages, strict=True):
+        assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
+
+
+def test_a_refiner_and_levels_of_detail_are_computed_on_a_gpu_from_one_thread(room, computed_there):
+    with pretend_gpu() as gpu:
+        refined = ps.compact(room, 0.5, ps.load_refiner(), effort="instant", resolution=(64, 48))
+        levels = ps.lod(room.to(GPU), ["50%", "20%"], resolution=(64, 48))
+        assert len(refined.scene) == 200 and [len(level.scene) for level in levels] == [200, 80]
+    check(gpu)
