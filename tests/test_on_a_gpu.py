@@ -1,11 +1,13 @@
 """What is computed where, by a GPU that is pretended: nothing on it from several threads, no linear algebra of a few
 numbers, and the same results as on the CPU."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import box_room, same
+from making import box_room, fast_config, same
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.looking.each_view import each_view
@@ -47,8 +49,6 @@ def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_device
         torch.linalg.det(means[:9].view(3, 3, 3))
         assert gpu.linear_algebra()
         assert not gpu.from_other_threads()
-        from concurrent.futures import ThreadPoolExecutor
-
         with ThreadPoolExecutor(1) as pool:
             pool.submit(means.square).result()
         assert gpu.from_other_threads() == {"aten.pow.Tensor_Scalar"}
@@ -132,3 +132,26 @@ def test_a_refiner_and_levels_of_detail_are_computed_on_a_gpu_from_one_thread(ro
         levels = ps.lod(room.to(GPU), ["50%", "20%"], resolution=(64, 48))
         assert len(refined.scene) == 200 and [len(level.scene) for level in levels] == [200, 80]
     check(gpu)
+
+
+@pytest.mark.parametrize("method", ["splatfacto-cpu", "pointsplat"])
+def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
+    method, trained_walls, wall_scene, wall_config, run_training, tmp_path
+):
+    def losses_on(device: torch.device) -> list[float]:
+        folder = tmp_path / device.type
+        if method == "pointsplat":
+            config = fast_config(trained_walls, folder, steps=3)
+        else:
+            config = wall_config(wall_scene, folder, 12)  # densification is in them
+        config.machine.device_type = device.type
+        for group in config.optimizers.values():
+            group["optimizer"].fused = False  # torch has no such kernels for the pretended device
+        return run_training(config)[1]
+
+    wanted = losses_on(torch.device("cpu"))
+    with pretend_gpu() as gpu:
+        found = losses_on(GPU)
+    check(gpu)
+    # rounding grows from step to step
+    torch.testing.assert_close(torch.tensor(found), torch.tensor(wanted), rtol=0.02, atol=0)

@@ -38,9 +38,8 @@ class StoppableTrainerConfig(TrainerConfig):
     """nerfstudio's trainer config, with the number of threads"""
 
     threads: int | None = None
-    """Number of threads of a training on a CPU. By default all that torch has, and one while other programs keep the
-    machine busy; the environment variable OMP_NUM_THREADS has the same effect as this.
-    Another number may change results by rounding."""
+    """Number of threads of a training on a CPU. By default as many as other programs leave cores; the environment
+    variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
 
     def save_config(self) -> None:
         """As nerfstudio's, but whole or not at all."""
@@ -61,7 +60,7 @@ class StoppableTrainerConfig(TrainerConfig):
 class StoppableTrainer(Trainer):
     """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
 
-    Steps on a CPU use one thread while other programs keep the machine busy
+    Steps on a CPU use as many threads as other programs leave cores
     (:func:`~pointsplat_ns.system.threads.suitable_threads`).
 
     Checkpoints and the other files of a run are written beside and renamed, so that one that is there is whole,

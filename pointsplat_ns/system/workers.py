@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from pointsplat_ns.system.threads import cores
+from pointsplat_ns.system.cores import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

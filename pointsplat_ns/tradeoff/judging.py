@@ -26,8 +26,8 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.cores import OtherPrograms
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.tradeoff.machine import OtherPrograms
 from pointsplat_ns.tradeoff.points import ImageMetrics, picture_path
 from pointsplat_ns.views import View, Views, spread_indices
 

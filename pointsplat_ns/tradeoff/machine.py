@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 
 from pointsplat_ns.system.claims import claim
+from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.threads import cores
 
 
 @dataclass(frozen=True)
@@ -63,29 +63,6 @@ def one_at_a_time(progress: Progress) -> Iterator[bool]:
             return
         yield True
     time.sleep(LOCK.pause)
-
-
-class OtherPrograms:
-    """Measures the mean number of cores that other programs use from now on."""
-
-    def __init__(self) -> None:
-        self._before = self._read()
-
-    @staticmethod
-    def _read() -> tuple[float, float, float]:
-        """Seconds: of the clock, of all used cores, and of this process."""
-        import psutil
-
-        times = psutil.cpu_times()
-        idle = times.idle + getattr(times, "iowait", 0.0)
-        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # also part of the user time
-        own = psutil.Process().cpu_times()
-        return time.monotonic(), sum(times) - idle - guests, own.user + own.system
-
-    def cores(self) -> float:
-        """Mean number of cores in use by others."""
-        seconds, used, own = (after - before for after, before in zip(self._read(), self._before, strict=True))
-        return max(0.0, used - own) / seconds if seconds > 0 else 0.0
 
 
 def is_busy(others: float) -> bool:

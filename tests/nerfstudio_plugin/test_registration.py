@@ -111,17 +111,17 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
 
 @pytest.fixture
 def three_threads(monkeypatch):
-    """Three threads and cores, which stall."""
+    """Three threads and cores, of which other programs leave two."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(threads, "cores", lambda: 3)
-    monkeypatch.setattr(threads.machine, "stalls", lambda count: True)
+    monkeypatch.setattr(threads, "free_cores", lambda: 2)
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     yield
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("count", "used"), [(None, 1), (2, 2)])
+@pytest.mark.parametrize(("count", "used"), [(None, 2), (1, 1)])
 def test_steps_use_the_threads_chosen_or_set(
     three_threads, monkeypatch, wall_scene, wall_config, tmp_path, count, used
 ):

@@ -13,6 +13,7 @@ from pointsplat_ns.rasterizer import pixels_of, projection, rasterization
 from pointsplat_ns.rasterizer import scene as scene_module
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project_scene
+from pretend_gpu import GPU, pretend_gpu
 
 F32, F64 = torch.float32, torch.float64
 
@@ -106,14 +107,20 @@ def test_quality_is_handed_on(room, views):
     assert 30 < psnr < 60, "nearly the same, and not the same"
 
 
-def test_a_view_goes_to_the_device_of_the_scene_in_the_precision_that_a_render_takes(room, views, monkeypatch):
+def test_a_camera_is_on_the_cpu_in_float64_whatever_the_scene_and_the_view_are(room, views, monkeypatch):
     given = []
-    monkeypatch.setattr(projection, "project", lambda *arguments, **_: given.extend(arguments))
-    view = dataclasses.replace(views[0], viewmat=views[0].viewmat.double(), K=views[0].K.double())
-    project_scene(room.to(device="meta"), view)  # a device that every machine has, for want of CUDA
-    *_, viewmat, K, width, height = given
-    assert (viewmat.device.type, viewmat.dtype) == ("meta", torch.float64), "places cameras far from the origin exactly"
-    assert (K.device.type, K.dtype) == ("meta", torch.float32) and (width, height) == (48, 36)
+
+    def recorded(centre_of):
+        return lambda viewmat: given.append(viewmat) or centre_of(viewmat)
+
+    monkeypatch.setattr(projection, "camera_centre", recorded(projection.camera_centre))
+    for dtype in (torch.float32, torch.float64):
+        view = dataclasses.replace(views[0], viewmat=views[0].viewmat.to(dtype), K=views[0].K.to(dtype))
+        with pretend_gpu():
+            project_scene(room.to(GPU), view)
+            project_scene(room.to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
+    assert len(given) == 4
+    assert all((viewmat.device.type, viewmat.dtype) == ("cpu", torch.float64) for viewmat in given)
 
 
 @pytest.mark.parametrize("compiled", [None, False])

@@ -22,6 +22,7 @@ GPU = torch.device("meta")
 """The device. Its name is one that torch knows, needs no library for, and whose backward pass runs where it is
 called."""
 
+
 @dataclass
 class Recorded:
     """Operations on the device since it is there."""

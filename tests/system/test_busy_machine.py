@@ -1,52 +1,65 @@
-"""The number of threads on a busy machine: by looks at a machine that is made up, and by a real one."""
+"""The number of threads beside other programs: on machines that are made up, and on a real one."""
 
-import math
 import os
+import subprocess
+import sys
 import threading
+import time
+from types import SimpleNamespace
 
+import psutil
 import pytest
 import torch
 
-from pointsplat_ns.system import threads
-from pointsplat_ns.system.threads import (
-    Load,
-    fixed_threads,
-    in_threads,
-    most_threads,
-    shared_operations,
-    suitable_threads,
-)
-
-CORES = 4
+from pointsplat_ns.system import cores as cores_module
+from pointsplat_ns.system.cores import FreeCores, Group, Limit, OtherPrograms
+from pointsplat_ns.system.threads import fixed_threads, in_threads, most_threads, suitable_threads
+from pretend_gpu import GPU
 
 
 class Machine:
-    """A clock, and threads that stall when they are told to."""
+    """Cores of which this process and others use some, by a clock of its own."""
 
     def __init__(self):
-        self.now, self.stalled, self.looks = 0.0, False, 0
-        self.load = Load(self.seconds, lambda: self.now)
+        self.count, self.now, self.own, self.looks = 16, 0.0, 0.0, 0
+        self.own_uses = self.others_use = 0.0  # cores
+        self.used = 0.0
+        self.quotas: list[tuple[float, float]] = []  # cores of a group, and those that others in it use
+        self.in_groups: list[float] = []
 
-    def seconds(self, count: int, bound: float) -> float:
-        self.looks += count > 1
-        seconds = 0.001 if count == 1 or not self.stalled else min(bound + 0.02, 1.0)
+    def wait(self, seconds: float) -> None:
         self.now += seconds
-        return seconds
+        self.own += self.own_uses * seconds
+        self.used += (self.own_uses + self.others_use) * seconds
+        self.in_groups = [
+            used + (self.own_uses + others) * seconds
+            for used, (_, others) in zip(self.in_groups or [0.0] * len(self.quotas), self.quotas, strict=True)
+        ]
 
-    def stalls(self, after: float = 0.0) -> bool:
-        self.now += after
-        return self.load.stalls(CORES)
+    def limit(self) -> Limit:
+        self.looks += 1
+        return Limit(self.count, self.used)
+
+    def groups(self, root=None) -> tuple[Group, ...]:
+        return tuple(Group(quota, number) for number, (quota, _) in enumerate(self.quotas))
 
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Four cores, of which torch uses all, in a machine that is made up."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(threads, "cores", lambda: CORES)
+    """Sixteen cores, of which torch uses all, in a machine that is made up."""
     made_up = Machine()
-    monkeypatch.setattr(threads, "machine", made_up.load)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    clock = SimpleNamespace(
+        monotonic=lambda: made_up.now, process_time=lambda: made_up.own, sleep=lambda seconds: made_up.wait(seconds)
+    )
+    monkeypatch.setattr(cores_module, "time", clock)
+    monkeypatch.setattr(cores_module, "_machine", made_up.limit)
+    monkeypatch.setattr(cores_module, "_allowed", lambda: [*range(made_up.count)])
+    monkeypatch.setattr(cores_module, "limiting_groups", made_up.groups)
+    monkeypatch.setattr(cores_module, "_seconds_of", lambda number: (made_up.in_groups or [0.0] * 9)[number])
+    monkeypatch.setattr("pointsplat_ns.system.threads.free_cores", FreeCores())
     before = torch.get_num_threads()
-    torch.set_num_threads(CORES)
+    torch.set_num_threads(made_up.count)
     yield made_up
     torch.set_num_threads(before)
 
@@ -56,51 +69,123 @@ def used(device: torch.device | None = None) -> int:
         return torch.get_num_threads()
 
 
-def test_all_threads_are_used_while_they_do_not_stall_else_one(machine):
-    assert used() == CORES
-    machine.stalled, machine.now = True, 10.0
-    assert used() == 1 and torch.get_num_threads() == CORES
+@pytest.mark.parametrize(
+    ("count", "others", "threads"),
+    [
+        (16, 0.0, 16),
+        (16, 0.4, 16),
+        (16, 2.1, 14),
+        (16, 15.2, 1),
+        (16, 16.0, 1),
+        (2, 0.3, 2),
+        (2, 2 / 3, 1),
+        (2, 2.0, 1),
+    ],
+)
+def test_as_many_threads_are_used_as_other_programs_leave_cores(machine, count, others, threads):
+    machine.count, machine.others_use = count, others
+    assert used() == threads
 
 
-def test_one_bad_look_is_enough_and_three_good_ones_are_needed(machine):
-    machine.stalls()
-    machine.stalled = True
-    assert machine.stalls(after=1)
-    machine.stalled = False
-    assert [machine.stalls(after=2) for _ in range(3)] == [True, True, False]
+def test_what_this_process_uses_itself_is_free_to_it(machine):
+    machine.own_uses = 14.0
+    machine.others_use = 2.0
+    assert used() == 14
+    machine.own_uses = 16.0
+    machine.others_use = 0.0
+    machine.wait(1.0)
+    assert used() == 16
 
 
-def test_the_callers_threads_are_restored_also_after_an_error(machine):
-    machine.stalled = True
+def test_the_machine_is_looked_at_once_a_second_and_the_number_follows(machine):
+    assert [used() for _ in range(5)] == [16] * 5
+    looks = machine.looks
+    machine.wait(0.9)
+    assert used() == 16 and machine.looks == looks
+    machine.others_use = 8.0
+    machine.wait(0.9)
+    assert used() == 12, "half of the time since the last look was before"
+    machine.wait(1.0)
+    assert used() == 8
+    machine.others_use = 0.0
+    machine.wait(1.0)
+    assert used() == 16
+
+
+@pytest.mark.parametrize(
+    ("quota", "in_group", "on_machine", "threads"),
+    [(4.0, 0.0, 40.0, 4), (4.0, 3.0, 40.0, 1), (4.0, 0.0, 62.0, 2), (2.5, 0.0, 0.0, 2), (100.0, 0.0, 10.0, 54)],
+)
+def test_in_a_container_its_own_load_counts_and_the_hosts_only_where_it_is_full(
+    machine, quota, in_group, on_machine, threads
+):
+    machine.count, machine.quotas, machine.others_use = 64, [(quota, in_group)], on_machine
+    torch.set_num_threads(64)
+    assert used() == threads
+
+
+def test_programs_on_cores_that_this_process_may_not_use_do_not_count(monkeypatch):
+    times = psutil.cpu_times(percpu=True)[0]
+    busy, idle = (times._replace(**{name: 0.0 for name in times._fields}) for _ in range(2))
+    busy, idle = busy._replace(user=7.0, system=2.0, idle=1.0), idle._replace(idle=10.0)
+    monkeypatch.setattr(psutil, "cpu_times", lambda percpu: [busy, idle, busy, idle])
+    monkeypatch.setattr(cores_module, "_allowed", lambda: [1, 2, 9])  # a container may be shown fewer than it has
+    assert cores_module._machine() == Limit(2, 9.0)
+
+
+def test_time_that_a_control_group_has_used_is_read_in_seconds(tmp_path):
+    assert cores_module._seconds_of(tmp_path) == 0.0
+    (tmp_path / "cpuacct.usage").write_text("2500000000\n")
+    (tmp_path / "cpu.stat").write_text("nr_periods 12\nnr_throttled 3\n")  # version 1
+    assert cores_module._seconds_of(tmp_path) == 2.5
+    (tmp_path / "cpu.stat").write_text("usage_usec 1500000\nuser_usec 1000000\n")  # version 2
+    assert cores_module._seconds_of(tmp_path) == 1.5
+
+
+def test_the_callers_threads_are_restored_also_after_an_error_and_nothing_is_said(machine, caplog):
+    machine.others_use = 13.0
     with pytest.raises(KeyboardInterrupt), suitable_threads():
-        assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3
         raise KeyboardInterrupt
-    assert torch.get_num_threads() == CORES and most_threads() == CORES
-    assert used() == 1, "it goes on choosing"
+    assert torch.get_num_threads() == 16 and most_threads() == 16
+    assert used() == 3
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_nothing_is_chosen_where_the_user_has(machine, count):
-    machine.stalled = True
+def test_nothing_is_chosen_where_the_user_has_or_on_a_gpu(machine, count):
+    machine.others_use = 15.0
     with fixed_threads(count):
         assert used() == count
-    assert torch.get_num_threads() == CORES and "OMP_NUM_THREADS" not in os.environ
+    assert used(GPU) == 16
+    assert torch.get_num_threads() == 16 and "OMP_NUM_THREADS" not in os.environ
 
 
 def test_pieces_that_do_not_wait_use_all_threads_in_a_step_on_one(machine):
-    machine.stalled = True
-    meet = threading.Barrier(CORES)  # passed only if so many are there at once
+    machine.count, machine.others_use = 4, 4.0
+    meet = threading.Barrier(4)  # passed only if so many are there at once
     with suitable_threads():
         assert torch.get_num_threads() == 1
-        in_threads(lambda item: meet.wait(30), range(CORES))
+        in_threads(lambda item: meet.wait(30), range(4), torch.device("cpu"))
 
 
-def test_a_real_look_works_in_every_mode_of_torch_and_changes_nothing():
+def test_pieces_for_a_gpu_are_worked_on_in_the_thread_that_asks(machine):
+    threads = set()
+    in_threads(lambda item: threads.add(threading.get_ident()), range(8), GPU)
+    assert threads == {threading.get_ident()}
+
+
+def test_a_real_busy_program_is_seen_and_a_look_changes_nothing():
     before = torch.get_num_threads()
-    threads._numbers.cache_clear()
-    with torch.inference_mode():
-        assert shared_operations(1, math.inf) > 0
-    assert shared_operations(1, math.inf) > 0
-    with suitable_threads():
-        assert 1 <= torch.get_num_threads() <= before
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        others = OtherPrograms()
+        time.sleep(1.0)  # what is counted includes the start of Python
+        assert 0.1 < others.cores() <= cores_module.cores()
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    with torch.inference_mode(), suitable_threads():
+        assert 1 <= torch.get_num_threads() <= max(before, 1)
     assert torch.get_num_threads() == before

@@ -10,8 +10,9 @@ import torch
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system import kernels
+from pointsplat_ns.system.cores import cores, cpu_quota
 from pointsplat_ns.system.kernels import agreement
-from pointsplat_ns.system.threads import cores, cpu_quota, fixed_threads
+from pointsplat_ns.system.threads import fixed_threads
 
 
 @pytest.mark.parametrize("wrong", [2.0, float("nan"), float("inf")])
@@ -135,7 +136,7 @@ def test_quotas_of_control_groups_are_read(tmp_path):
 @pytest.mark.parametrize(("quota", "expected"), [(None, 4), (1.5, 1), (0.2, 1), (3.0, 3), (64.0, 4)])
 def test_cores_are_those_of_the_affinity_and_the_quota(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 2, 4, 6}, raising=False)
-    monkeypatch.setattr("pointsplat_ns.system.threads.cpu_quota", lambda: quota)
+    monkeypatch.setattr("pointsplat_ns.system.cores.cpu_quota", lambda: quota)
     assert cores() == expected
 
 
