@@ -9,22 +9,11 @@ import torch
 import golden
 import pointsplat_ns as ps
 from making import assert_same_on_any_threads, box_room
-from pointsplat_ns.rasterizer import pixels_of, projection, rasterization
+from pointsplat_ns.rasterizer import pixels_of, projection
 from pointsplat_ns.rasterizer import scene as scene_module
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project_scene
 from pretend_gpu import GPU, pretend_gpu
-
-F32, F64 = torch.float32, torch.float64
-
-STORED = 1e-6
-"""Of the largest value: the file holds float32, whose rounding is 6e-8, and depths and gradients are sums of such."""
-
-IMAGE_32 = 1e-5
-"""Of the largest value, for float32: ten times what some tens of layers of rounding were seen to become."""
-
-GRADIENT_32 = 1e-4
-"""Of a gradient's norm, for float32: ten times what was seen; a gradient is a sum over pixels that partly cancel."""
 
 TORCH = {"compiled": False}
 
@@ -52,43 +41,18 @@ def test_a_changed_file_has_a_written_reason():
     assert golden.GOLDEN.stat().st_size < 200_000
 
 
-def draw(scene, shape, dtype, device="cpu", **options):
-    """What the fast path makes of a stored scene: image, alphas, gradients, in float64."""
-    leaves = {name: scene[name].to(device, dtype, copy=True).requires_grad_() for name in golden.NAMES}
-    background = torch.tensor([shape.background], device=device, dtype=dtype) if shape.background is not None else None
-    renders, alphas, _ = rasterization(
-        *leaves.values(), scene["viewmat"][None].to(leaves["means"]), scene["K"][None].to(leaves["means"]),
-        golden.WIDTH, golden.HEIGHT, sh_degree=shape.sh_degree, backgrounds=background, render_mode=shape.render_mode,
-        rasterize_mode=shape.mode, **options,
-    )  # fmt: skip
-    grads = torch.autograd.grad(golden.total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
-    of_names = {f"grad of {name}": grad for name, grad in zip(golden.NAMES, grads, strict=True)}
-    return {
-        name: value.detach().to("cpu", F64)
-        for name, value in {"image": renders[0], "alphas": alphas[0], **of_names}.items()
-    }
-
-
-def compare(got, wanted, image, gradient):
-    for name in ("image", "alphas"):
-        off = (got[name] - wanted[name]).abs().max() / wanted[name].abs().max()
-        assert off <= image, (name, float(off))
-    for name in (f"grad of {part}" for part in golden.NAMES):
-        off = (got[name] - wanted[name]).norm() / wanted[name].norm()
-        assert off <= gradient, (name, float(off))
-
-
 @pytest.mark.parametrize("name", golden.SCENES)
 def test_the_reference_is_what_it_was(name, stored):
-    compare(golden.drawn_by_reference(golden.SCENES[name], stored[name]), stored[name], STORED, STORED)
+    drawn = golden.drawn_by_reference(golden.SCENES[name], stored[name])
+    golden.compare(drawn, stored[name], golden.STORED, golden.STORED)
 
 
 @pytest.mark.parametrize("options", PATHS.values(), ids=PATHS)
-@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("dtype", golden.TOLERANCES)
 @pytest.mark.parametrize("name", golden.SCENES)
 def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):
-    tolerances = (STORED, STORED) if dtype == F64 else (IMAGE_32, GRADIENT_32)
-    compare(draw(stored[name], golden.SCENES[name], dtype, **options), stored[name], *tolerances)
+    drawn = golden.drawn(golden.SCENES[name], stored[name], dtype, **options)
+    golden.compare(drawn, stored[name], *golden.TOLERANCES[dtype])
 
 
 @pytest.fixture(scope="module")

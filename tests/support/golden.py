@@ -29,6 +29,13 @@ WIDTH, HEIGHT = 26, 18  # twelve tiles, some of them cut off: compiled kernels a
 COUNT = 16
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
+STORED = 1e-6
+"""Of the largest value: the file holds float32, whose rounding is 6e-8, and depths and gradients are sums of such."""
+
+TOLERANCES = {torch.float32: (1e-5, 1e-4), torch.float64: (STORED, STORED)}
+"""Of the largest value of an image, and of a gradient's norm. For float32 ten times what was seen: an image is rounded
+by some tens of layers, and a gradient is a sum over pixels that partly cancel."""
+
 
 @dataclass(frozen=True)
 class Golden:
@@ -143,6 +150,36 @@ def drawn_by_reference(golden: Golden, scene: dict[str, Tensor]) -> dict[str, Te
     grads = torch.autograd.grad(total(image, alphas), list(leaves.values()), materialize_grads=True)
     of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
     return {"image": image.detach(), "alphas": alphas.detach(), **of_names}
+
+
+def drawn(
+    golden: Golden, scene: dict[str, Tensor], dtype: torch.dtype, device: torch.device | str = "cpu", **options
+) -> dict[str, Tensor]:
+    """As :func:`drawn_by_reference`, by the fast path in some precision on a device; ``options`` are those of
+    :func:`pointsplat_ns.rasterization`."""
+    from pointsplat_ns.rasterizer import rasterization
+
+    leaves = {name: scene[name].to(device, dtype, copy=True).requires_grad_() for name in NAMES}
+    background = None if golden.background is None else torch.tensor([golden.background], device=device, dtype=dtype)
+    renders, alphas, _ = rasterization(
+        *leaves.values(), scene["viewmat"][None].to(leaves["means"]), scene["K"][None].to(leaves["means"]),
+        WIDTH, HEIGHT, sh_degree=golden.sh_degree, backgrounds=background, render_mode=golden.render_mode,
+        rasterize_mode=golden.mode, **options,
+    )  # fmt: skip
+    grads = torch.autograd.grad(total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
+    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
+    found = {"image": renders[0], "alphas": alphas[0], **of_names}
+    return {name: value.detach().to("cpu", torch.float64) for name, value in found.items()}
+
+
+def compare(found: dict[str, Tensor], wanted: dict[str, Tensor], image: float, gradient: float) -> None:
+    """Raise AssertionError unless images agree to a share of the largest value, and gradients of their norm."""
+    for name in ("image", "alphas"):
+        off = (found[name] - wanted[name]).abs().max() / wanted[name].abs().max()
+        assert off <= image, (name, float(off))
+    for name in (f"grad of {part}" for part in NAMES):
+        off = (found[name] - wanted[name]).norm() / wanted[name].norm()
+        assert off <= gradient, (name, float(off))
 
 
 def far_from_thresholds(golden: Golden, scene: dict[str, Tensor]) -> bool:

@@ -1,0 +1,70 @@
+"""The program for GPU machines, tried on the CPU."""
+
+import pytest
+import torch
+
+import golden
+from lab.speed import cuda
+from pointsplat_ns.errors import PointSplatError
+from pretend_gpu import GPU, pretend_gpu
+
+CHECKS = (
+    "golden pictures", "prune, the room that ships", "compact, the room that ships", "prune, bare walls",
+    "compact, bare walls", "training of a scene, resumed", "training of a refiner, resumed", "times of torch",
+)  # fmt: skip
+
+
+def test_every_check_passes_where_both_devices_are_the_cpu(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cuda.main(device="cpu", steps=4, every=80, resolution=(96, 64))
+    lines = capsys.readouterr().out.splitlines()
+    assert ended.value.code == 0, lines
+    for name in CHECKS:
+        assert [line for line in lines if line.startswith(f"pass  {name} (")], lines
+    assert f"{len(CHECKS)} of {len(CHECKS)} passed" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ([(100, 30.0), (100, 30.09)], None),
+        ([(100, 30.0), (101, 30.0)], "101 Gaussians; expected 100, as on the CPU"),
+        ([(100, 30.0), (100, 29.8)], "29.80 dB; expected 30.00, as on the CPU"),
+        ([(100, 30.0), (100, float("nan"))], "nan dB; expected 30.00, as on the CPU"),
+    ],
+)
+def test_a_device_fails_that_keeps_another_number_or_loses_more(found, said, capsys):
+    assert cuda.passes("prune", lambda: cuda.compared(found)) == (said is None)
+    printed = capsys.readouterr().out
+    assert printed.startswith("pass  prune" if said is None else "FAIL  prune") and (said or "dB") in printed
+
+
+def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys):
+    monkeypatch.setattr(cuda, "rasterization", None)
+    monkeypatch.setattr(golden, "TOLERANCES", {torch.float32: (0.0, 0.0)})
+    for name in ("pruned", "compacted"):
+        monkeypatch.setattr(cuda, name, lambda *arguments: "not tried")
+    for name in ("of_a_scene", "of_a_refiner"):
+        monkeypatch.setattr(cuda.Trainings, name, lambda self: "not tried")
+    with pytest.raises(SystemExit) as ended:
+        cuda.main(device="cpu", every=80)
+    printed = capsys.readouterr().out
+    assert ended.value.code == 1
+    assert "FAIL  golden pictures" in printed and "FAIL  times of torch" in printed and "6 of 8 passed" in printed
+
+
+def test_what_is_compared_is_drawn_on_the_device(capsys):
+    scene = cuda.scenes_of(80)["the room that ships"]
+    with pretend_gpu() as gpu:
+        assert cuda.passes("golden pictures", lambda: cuda.golden_pictures(GPU))
+        assert len(gpu.operations) > 1000
+        assert cuda.passes("prune", lambda: cuda.pruned(scene, GPU))
+        gpu.operations.clear()
+        assert cuda.passes("times", lambda: cuda.times(scene, GPU, "torch", rounds=1))
+        assert len(gpu.operations) > 1000
+    assert "pass  times" in capsys.readouterr().out
+
+
+def test_options_without_a_meaning_are_refused():
+    with pytest.raises(PointSplatError, match="1 steps, every 1; expected at least 2 steps"):
+        cuda.main(device="cpu", steps=1)
