@@ -171,7 +171,7 @@ class Trainings:
 
         def recorded(step: int) -> Any:
             result = step_of(step)
-            losses.append(float(result[0]))
+            losses.append(float(result[0].detach()))
             return result
 
         trainer.train_iteration = recorded

@@ -63,12 +63,16 @@ class OtherPrograms:
 
 
 def _machine() -> Limit:
-    """The cores that this process may be scheduled on."""
+    """The cores that this process may be scheduled on; where the system does not say what is used, nothing is."""
     import psutil
 
-    times = psutil.cpu_times(percpu=True)
-    seen = [times[number] for number in _allowed() if number < len(times)]  # a container may be shown fewer
-    return Limit(len(seen), sum(_busy(each) for each in seen))
+    allowed = _allowed()
+    try:
+        times = psutil.cpu_times(percpu=True)
+    except (OSError, psutil.Error):
+        times = []
+    seen = [times[number] for number in allowed if number < len(times)]  # a container may be shown fewer
+    return Limit(len(seen) or len(allowed), sum(_busy(each) for each in seen))
 
 
 def _busy(times) -> float:

@@ -133,6 +133,15 @@ def test_programs_on_cores_that_this_process_may_not_use_do_not_count(monkeypatc
     assert cores_module._machine() == Limit(2, 9.0)
 
 
+def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypatch):
+    def refused(percpu):
+        raise PermissionError(13, "Permission denied", "/proc/stat")
+
+    monkeypatch.setattr(psutil, "cpu_times", refused)
+    monkeypatch.setattr(cores_module, "_allowed", lambda: [0, 1, 2])
+    assert cores_module._machine() == Limit(3, 0.0)
+
+
 def test_time_that_a_control_group_has_used_is_read_in_seconds(tmp_path):
     assert cores_module._seconds_of(tmp_path) == 0.0
     (tmp_path / "cpuacct.usage").write_text("2500000000\n")
