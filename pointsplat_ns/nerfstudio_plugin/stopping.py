@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import signal
 import sys
 import threading
@@ -33,6 +34,10 @@ STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
 
+_AT_LEAST_ONE = ("steps_per_log", "max_buffer_size")
+"""Numbers of the log of which nerfstudio's writer cannot use 0."""
+
+
 @dataclass
 class StoppableTrainerConfig(TrainerConfig):
     """nerfstudio's trainer config, with the number of threads"""
@@ -42,11 +47,36 @@ class StoppableTrainerConfig(TrainerConfig):
     variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all."""
+        """As nerfstudio's, but whole or not at all, and in a folder of its own (:meth:`take_folder`)."""
+        self.take_folder()
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         with replacing(path) as part:
             part.write_text(yaml.dump(self), "utf-8")
+
+    def take_folder(self) -> None:
+        """Make the folder of the run. If there is one of that name, as of a training that was started in the same
+        second, change the timestamp: two trainings in one folder would replace each other's files. A training that
+        resumes from a checkpoint in its own folder stays there. Raises PointSplatError if no folder can be made."""
+        given = self.get_base_dir()
+        resumed = self.load_dir or (self.load_checkpoint and self.load_checkpoint.parent)
+        if resumed is not None and resumed.resolve() == self.get_checkpoint_dir().resolve():
+            return
+        timestamp = self.timestamp
+        try:
+            given.parent.mkdir(parents=True, exist_ok=True)
+            for number in itertools.count(2):
+                try:
+                    self.get_base_dir().mkdir()
+                    break
+                except FileExistsError:
+                    self.timestamp = f"{timestamp}_{number}"
+        except OSError as error:
+            raise PointSplatError(
+                f"{given}: cannot be made as the folder of this training ({error.strerror}); name another --output-dir"
+            ) from error
+        if self.timestamp != timestamp:
+            CONSOLE.log(f"{given} is the folder of another training; this one gets {self.get_base_dir()}")
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or what the name of the checkpoint says that it goes on from."""
@@ -78,11 +108,12 @@ class StoppableTrainer(Trainer):
     """Whether it was stopped where a checkpoint can be saved."""
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's. If the data cannot be used, the run folder, which then holds only the config, is removed
-        before the PointSplatError."""
+        """As nerfstudio's. If the data or a number of steps cannot be used, the run folder, which then holds only the
+        config, is removed before the PointSplatError."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
+            self._need_steps()
             super().setup(test_mode)
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
@@ -192,6 +223,16 @@ class StoppableTrainer(Trainer):
         if self._asked is not None:
             self._between_steps = True
             raise KeyboardInterrupt
+
+    def _need_steps(self) -> None:
+        numbers = {"max-num-iterations": self.config.max_num_iterations}
+        numbers |= {f"logging.{n.replace('_', '-')}": getattr(self.config.logging, n) for n in _AT_LEAST_ONE}
+        for option, number in numbers.items():
+            if number < 1:
+                raise PointSplatError(
+                    f"--{option} {number}: expected at least 1; a run is shown and measured without a training by "
+                    "ns-viewer, ns-render and ns-eval"
+                )
 
     def _withdraw(self) -> None:
         config = self.base_dir / "config.yml"

@@ -29,14 +29,16 @@ class UndistortedDataset(InputDataset):
     """Photos, masks and cameras of a split, undistorted together by nerfstudio's own function.
 
     ``cameras`` (C,) are pinholes. They differ in size and intrinsics from ``lens_cameras``, which took the photos,
-    where these have a lens. Raises DataError if a pose or an intrinsic is NaN or infinite, or a lens cannot be undone;
-    when a photo is read that is missing, broken, not the size that its camera says, or not of 8 bits a channel, or
-    whose mask is.
+    where these have a lens. Raises DataError if a photo has no pose, a pose or an intrinsic is NaN or infinite, photos
+    are of several times, or a lens cannot be undone; when a photo is read that is missing, broken, not the size that
+    its camera says, or not of 8 bits a channel, or whose mask is.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
+        _need_poses(self)
         _need_finite(self)
+        _need_one_time(self)
         self.lens_cameras = self.cameras
         self.cameras = self._pinholes()
 
@@ -132,6 +134,18 @@ def _undistorted(
     return K, image, mask
 
 
+def _need_poses(dataset: InputDataset) -> None:
+    """Refuse poses that are not one for each photo. nerfstudio's ``instant-ngp-data`` loses that of a single photo: it
+    indexes a numpy array by a tensor of one number, which numpy takes for the number."""
+    found, expected = tuple(dataset.cameras.camera_to_worlds.shape), (len(dataset.image_filenames), 3, 4)
+    if found != expected:
+        raise DataError(
+            f"{dataset.image_filenames[0]}: the dataparser gives poses of shape {found} for this photo and "
+            f"{expected[0] - 1} more of its split; expected {expected}; if it is the only photo held out, let the "
+            "dataparser hold out two (instant-ngp-data loses the pose of a single one), as by --train-split-fraction"
+        )
+
+
 def _need_finite(dataset: InputDataset) -> None:
     """Refuse cameras with NaN or infinity; the error names the first photo."""
     cameras = dataset.cameras
@@ -141,6 +155,18 @@ def _need_finite(dataset: InputDataset) -> None:
         raise DataError(
             f"{dataset.image_filenames[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, as "
             f"do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them or leave the photo out"
+        )
+
+
+def _need_one_time(dataset: InputDataset) -> None:
+    """Refuse photos of a scene that moves. Photos without times are taken to be of a still scene."""
+    times = dataset.cameras.times
+    count = 1 if times is None else len(times.unique())
+    if count > 1:
+        raise DataError(
+            f"{dataset.image_filenames[0].parent}: its {len(dataset.cameras)} photos are of {count} different times; "
+            "expected photos of a scene that does not move, as Gaussians here have no time; take the photos of one "
+            "moment"
         )
 
 

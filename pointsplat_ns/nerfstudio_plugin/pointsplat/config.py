@@ -19,7 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
-from pointsplat_ns.system.processes import connect_torchrun, gathered, local_rank, rank, torchrun_rank
+from pointsplat_ns.system.processes import by_first, connect_torchrun, gathered, local_rank, rank, torchrun_rank
 
 REFINER_RATES = {
     "encoder": 1e-4,
@@ -64,8 +64,8 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     prompt: Suppress[Fixed[str | None]] = None
 
     def set_timestamp(self) -> None:
-        """As nerfstudio's; of processes that ``torchrun`` started, which are connected here, all take the first one's.
-        Raises PointSplatError if nerfstudio is to start several processes on a CPU, which it cannot."""
+        """As nerfstudio's; processes that ``torchrun`` started are connected here. Raises PointSplatError if nerfstudio
+        is to start several processes on a CPU, which it cannot."""
         kind, number = self.machine.device_type, self.machine.num_devices
         if kind != "cuda" and number > 1:
             raise PointSplatError(
@@ -74,7 +74,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             )
         super().set_timestamp()
         connect_torchrun("nccl" if kind == "cuda" else "gloo")
-        self.timestamp = gathered([self.timestamp])[0]
 
     def print_to_terminal(self) -> None:
         """As nerfstudio's, by the first process."""
@@ -82,9 +81,9 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
             super().print_to_terminal()
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all, and by the first process."""
-        if rank() == 0:
-            super().save_config()
+        """As nerfstudio's, but whole or not at all, and by the first process, whose folder all take."""
+        by_first(super().save_config)
+        self.timestamp = gathered([self.timestamp])[0]
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose rates are set.
