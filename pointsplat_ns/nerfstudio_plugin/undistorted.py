@@ -138,7 +138,7 @@ def _need_poses(dataset: InputDataset) -> None:
     """Refuse poses that are not one for each photo. nerfstudio's ``instant-ngp-data`` loses that of a single photo: it
     indexes a numpy array by a tensor of one number, which numpy takes for the number."""
     found, expected = tuple(dataset.cameras.camera_to_worlds.shape), (len(dataset.image_filenames), 3, 4)
-    if found != expected:
+    if dataset.image_filenames and found != expected:
         raise DataError(
             f"{dataset.image_filenames[0]}: the dataparser gives poses of shape {found} for this photo and "
             f"{expected[0] - 1} more of its split; expected {expected}; if it is the only photo held out, let the "

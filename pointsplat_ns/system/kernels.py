@@ -17,7 +17,8 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -263,8 +264,14 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))
     threads = (threads or torch.get_num_threads()) if worth_it else 1
-    others = [_pool(os.getpid()).submit(call) for _ in range(threads - 1)]
-    call()
+    others: list[Future[object]] = []
+    try:
+        with suppress(RuntimeError):  # a program that is ending starts no more threads: this one does it all
+            for _ in range(threads - 1):
+                others.append(_pool(os.getpid()).submit(call))
+        call()
+    finally:
+        wait(others)  # they use the memory of the arguments, also where Ctrl-C ended the call here
     for other in others:
         other.result()
 

@@ -37,7 +37,7 @@ def test_trainings_of_one_timestamp_get_a_folder_each(method, tmp_path):
 
 
 @METHODS
-def test_a_training_resumed_in_its_own_folder_stays_and_one_elsewhere_does_not(method, tmp_path):
+def test_a_training_resumed_in_its_own_folder_stays_there(method, tmp_path):
     first = config_of(method, tmp_path)
     first.save_config()
     folder = first.get_checkpoint_dir()

@@ -3,6 +3,9 @@
 import os
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -24,6 +27,28 @@ def test_tensors_agree_up_to_a_share_of_numbers_that_are_off_or_not_finite(wrong
     assert agreement([off], [right], off=1e-3, share=0.03)
     assert not agreement([off], [right], off=1e-3, share=0.02)
     assert not agreement([right, right + 2e-3], [right, right], off=1e-3, share=0.01)
+
+
+def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():
+    caller, ended = threading.get_ident(), []
+
+    def function(_):
+        if threading.get_ident() == caller:
+            raise KeyboardInterrupt
+        time.sleep(0.2)
+        ended.append(threading.get_ident())
+
+    with pytest.raises(KeyboardInterrupt):
+        kernels.on_threads(True, function, threads=3)
+    assert len(ended) == 2
+
+
+def test_a_program_that_is_ending_calls_kernels_in_its_own_thread(monkeypatch):
+    pool, called = ThreadPoolExecutor(1), []
+    pool.shutdown()
+    monkeypatch.setattr(kernels, "_pool", lambda process: pool)
+    kernels.on_threads(True, lambda _: called.append(threading.get_ident()), threads=3)
+    assert called == [threading.get_ident()]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
