@@ -137,7 +137,10 @@ class StoppableTrainer(Trainer):
         and ends with 0, as if it had finished. Raises PointSplatError if the number of threads is below 1."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
-                super().train()
+                try:
+                    super().train()
+                finally:
+                    self.end_background()
             except KeyboardInterrupt:
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
@@ -146,6 +149,9 @@ class StoppableTrainer(Trainer):
                         f"{self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
+
+    def end_background(self) -> None:
+        """End what a training does beside its steps; by default there is nothing."""
 
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open after the last step until Ctrl-C or SIGTERM. The training is complete: they end it as

@@ -104,9 +104,9 @@ class PruneSettings:
             raise PointSplatError(f"{self.by} looks at a scene from poses; expected a method that needs none")
         check_opacity_weight(method, self.opacity_weight)
 
-    def prune(self, scene: Gaussians) -> Gaussians:
+    def prune(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Gaussians:
         """Prune a scene with these settings; see :func:`prune`."""
-        return prune(scene, self.keep, self.by, opacity_weight=self.opacity_weight)
+        return prune(scene, self.keep, self.by, opacity_weight=self.opacity_weight, progress=progress)
 
 
 def prune(

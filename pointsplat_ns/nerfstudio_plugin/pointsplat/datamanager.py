@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share, to_device
+from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
@@ -98,6 +100,9 @@ class ScenesDataManager(SpiralSource):
         if config.sampled_poses < 1 or min(config.sampled_size) < 1:
             size = "{} x {}".format(*config.sampled_size)
             raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
+        self.background = Background()
+        """Prepares scenes before the steps that use them."""
+        self._pixels = 0
         gigabytes = config.cache_gigabytes
         self.cache = MemoryCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
         held_out_poses = max(1, config.sampled_poses // 5)
@@ -162,24 +167,36 @@ class ScenesDataManager(SpiralSource):
         """The place of this process in the common sequence of scenes, at one of its steps."""
         return step * self.world_size + self.local_rank
 
-    def _choice(self, step: int) -> tuple[int, list[int]]:
-        """Scene and photos of a step. Each scene comes once before any is repeated; photos are drawn at random without
-        repetition within the step."""
-        step = self.place(step)
-        epoch, place = divmod(step, len(self.train_indices))
+    def scene_at(self, step: int) -> int:
+        """Index of the scene of a step. Each scene comes once before any is repeated."""
+        epoch, place = divmod(self.place(step), len(self.train_indices))
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
-        scene = order[place]
+        return order[place]
+
+    def _choice(self, step: int) -> tuple[int, list[int]]:
+        """Scene and photos of a step. Photos are drawn at random without repetition within the step."""
+        scene = self.scene_at(step)
         count = len(self.training_frames(scene))
-        chosen = random.Random(f"{self.config.seed} photos {step}")
+        chosen = random.Random(f"{self.config.seed} photos {self.place(step)}")
         return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
+
+    def start(self, step: int) -> None:
+        """Prepare the photos of a step in the background, or the poses of its renders, which are drawn when they are
+        needed. An error is raised by :meth:`next_train`."""
+        self.background.start(step, functools.partial(self._ready, step))
+
+    def _ready(self, step: int) -> tuple[int, list[int]]:
+        """Choose scene and photos of a step, and begin to decode them."""
+        scene, photos = self._choice(step)
+        self.training_frames(scene).prefetch(photos)
+        return scene, photos
 
     def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on this process's device."""
-        scene, photos = self._choice(step)
+        scene, photos = self.background.take(step, functools.partial(self._choice, step))
         targets = self.training_frames(scene)
         frames = [to_device(targets[i], self.device) for i in photos]
-        next_scene, next_photos = self._choice(step + 1)
-        self.training_frames(next_scene).prefetch(next_photos)
+        self._pixels = sum(int(camera.height) * int(camera.width) for camera, _ in frames)
         return scene, frames
 
     def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
@@ -202,9 +219,8 @@ class ScenesDataManager(SpiralSource):
         return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
 
     def get_train_rays_per_batch(self) -> int:
-        """Pixels of a step, for nerfstudio's log."""
-        cameras = self.training_frames(self.train_indices[0]).dataset.cameras
-        return int(cameras.height[0]) * int(cameras.width[0]) * self.config.images_per_step
+        """Pixels of the latest step, for nerfstudio's log."""
+        return self._pixels
 
     def get_eval_rays_per_batch(self) -> int:
         """Pixels of a held-out photo, for nerfstudio's log."""

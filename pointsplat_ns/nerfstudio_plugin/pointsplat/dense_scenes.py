@@ -20,6 +20,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.pictures import in_unit_range
@@ -125,12 +126,15 @@ class DenseScene:
 
     def cameras(self, split: Split) -> Cameras:
         """Pinhole cameras (C,) sampled in free space, different ones for each split. Every second one of the training
-        split is subsampled from a picture of the size that people look at. Raises DataError if nothing of the scene is
-        visible, or no free position is found."""
+        split is subsampled from a picture of the size that people look at. Raises DataError, which names the file, if
+        nothing of the scene is visible, or no free position is found."""
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
         count = poses.train if split == "train" else poses.test
-        views = sample_views(self.dense(keep=True), count, poses.width, poses.height, seed)
+        try:
+            views = sample_views(self.dense(keep=True), count, poses.width, poses.height, seed)
+        except DataError as error:
+            raise DataError(f"{self.source}: {error}") from error
         cameras, side = cameras_of_views(views), max(poses.width, poses.height)
         if split == "train" and side < max(RESOLUTION) and cameras.metadata is not None:
             cameras.metadata["eps2d"][1::2] = subsampled(views, max(RESOLUTION), side).eps2d
@@ -191,7 +195,11 @@ class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
 
     def __init__(self, scene: DenseScene, split: Split, image_type: Literal["uint8", "float32"]):
         self._scene, self._split, self.image_type = scene, split, image_type
-        self.cameras = scene.cameras(split)
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """The cameras, found when they are first needed."""
+        return self._scene.cameras(self._split)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -227,10 +235,21 @@ class RenderedDataset:
     """Renders of a scene, with the part of a dataset's interface that nerfstudio's viewer and ``ns-render`` use."""
 
     def __init__(self, frames: RenderedFrames):
-        self._frames, self.cameras = frames, frames.cameras
+        self._frames = frames
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras of the renders."""
+        return self._frames.cameras
+
+    @property
+    def _dataparser_outputs(self) -> DataparserOutputs:
         # There are no files: ``ns-render dataset`` names its own after these.
-        names = [Path(f"{index:05d}.png") for index in range(len(frames))]
-        self._dataparser_outputs = DataparserOutputs(image_filenames=names, cameras=frames.cameras)
+        names = [Path(f"{index:05d}.png") for index in range(len(self))]
+        return DataparserOutputs(image_filenames=names, cameras=self.cameras)
+
+    def __bool__(self) -> bool:
+        return True  # of no scene are there no poses; nerfstudio asks before they have to be found
 
     def __len__(self) -> int:
         return len(self._frames)

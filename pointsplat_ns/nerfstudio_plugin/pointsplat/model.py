@@ -28,6 +28,7 @@ from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.metrics import psnr
 from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedScene, PrunedScenes
@@ -136,16 +137,16 @@ class PointSplatModel(SplatfactoModel):
         self.shown = 0
         """Index of the scene that the viewer and the exporter get."""
         self.loss = PhotoLoss(self.config.pixel_loss, self.config.lpips_weight, self.config.lpips_net)
-        self._pruned = self._pruned_within(MemoryCache(0))
+        self._pruned = self._pruned_within(MemoryCache(0), Background())
         self._refined: tuple[int, Gaussians] | None = None
 
-    def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache) -> None:
-        """Set the scenes, the index of the one that the viewer and the exporter get, and the cache for pruned
-        scenes."""
-        self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache)
+    def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache, background: Background) -> None:
+        """Set the scenes, the index of the one that the viewer and the exporter get, the cache for pruned scenes, and
+        what prunes them ahead."""
+        self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache, background)
 
-    def _pruned_within(self, cache: MemoryCache) -> PrunedScenes:
-        return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare)
+    def _pruned_within(self, cache: MemoryCache, background: Background) -> PrunedScenes:
+        return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare, background)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the
@@ -173,6 +174,11 @@ class PointSplatModel(SplatfactoModel):
         already; ``keep`` is by default the config's. Raises PointSplatError if the settings do not fit this scene."""
         return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
 
+    def start(self, index: int, generator: torch.Generator) -> None:
+        """Prune a scene in the background, by its index, for a training step whose random numbers are those of the
+        generator. An error is raised by that step."""
+        self._pruned.start(self.scenes[index], self.config.prune_settings(self._drawn_keep(generator)))
+
     def refine(self, index: int) -> Gaussians:
         """The refined scene; differentiable in training, cached in evaluation."""
         if self.training:
@@ -188,10 +194,11 @@ class PointSplatModel(SplatfactoModel):
                 self._refined = index, self.refiner(scene.pruned, scene.structure)
         return self._refined[1]
 
-    def _drawn_keep(self) -> float | None:
-        """The budget of a training step, drawn at random if there are several; None is the config's ``keep``."""
+    def _drawn_keep(self, generator: torch.Generator | None = None) -> float | None:
+        """The budget of a training step, its first random number if there are several; None is the config's
+        ``keep``."""
         keeps = (self.config.keep, *self.config.more_keeps)
-        return keeps[int(torch.randint(len(keeps), (), device="cpu"))] if len(keeps) > 1 else None
+        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu"))] if len(keeps) > 1 else None
 
     def timed_refine(self, index: int) -> tuple[Gaussians, float]:
         """As :meth:`refine` in evaluation, but not from the cache, and the seconds that it took."""

@@ -39,6 +39,10 @@ MODEL_METADATA = (
 TRAINER_METADATA = ("rates", "rate_factor", "schedule")
 """Settings of the trainer in the metadata of a saved network."""
 
+LOOK_AHEAD = 4
+"""Number of steps whose scenes are prepared ahead: enough that the background has work while a long step goes on, few
+enough that pruned scenes which wait take little memory."""
+
 
 @dataclass
 class PointSplatPipelineConfig(VanillaPipelineConfig):
@@ -80,7 +84,8 @@ class PointSplatPipeline(VanillaPipeline):
         torch.manual_seed(config.datamanager.seed)
         self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
         self.model.to(device)
-        self.model.attach(self.datamanager.scenes, self.datamanager.shown, self.datamanager.cache)
+        manager = self.datamanager
+        self.model.attach(manager.scenes, manager.shown, manager.cache, manager.background)
         processes.share_state(self.model.refiner)
         if world_size > 1:
             distributed.synchronise_batch_norm(self.model.refiner)
@@ -109,14 +114,17 @@ class PointSplatPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
         """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos.
 
+        The step waits only for its own scene. Those of the next steps are read and pruned in the background.
+
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
         been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
         over processes; the gradients are each process's own. The metric ``faults`` is a list of texts, one for each
         loss of this process that is not finite.
         """
-        place = self.datamanager.place(step)
-        torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
+        for later in range(step, step + 1 + LOOK_AHEAD):
+            self._start(later)
+        torch.manual_seed(self._seed(step))
         index, frames = self.datamanager.next_train(step)
         outputs, losses, metrics = self.model.losses(index, frames)
         faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
@@ -125,6 +133,16 @@ class PointSplatPipeline(VanillaPipeline):
             losses = {name: distributed.with_value(value, means[name]) for name, value in losses.items()}
         metrics |= {"psnr": means["psnr"], "scene": index, "faults": faults}
         return outputs, losses, metrics
+
+    def _seed(self, step: int) -> int:
+        """Seed of the random numbers of a step."""
+        place = self.datamanager.place(step)
+        return random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63)
+
+    def _start(self, step: int) -> None:
+        """Prepare the scene of a step in the background."""
+        self.datamanager.start(step)
+        self.model.start(self.datamanager.scene_at(step), torch.Generator("cpu").manual_seed(self._seed(step)))
 
     @torch.no_grad()
     def get_eval_loss_dict(self, step: int) -> tuple[Any, dict, dict]:

@@ -1,8 +1,10 @@
-"""Pruned scenes, each computed once: kept in memory while there is room, and on disk if a folder is given."""
+"""Pruned scenes, each computed once, also in the background: kept in memory while there is room, and on disk if a
+folder is given."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -19,6 +21,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import file_stem, one_line, write_tensors
 from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refiner import Structure
@@ -54,12 +57,25 @@ class PrunedScenes:
     Args:
         cache: keeps pruned scenes in memory. The latest one is kept even if the cache has no room for it.
         folder: keeps pruned scenes on disk, by the content of the dense scene's file; None keeps none.
-        prepare: computes the neighbour tables that the network needs.
+        prepare: computes the neighbour tables that the network needs, on the network's device.
+        background: prunes scenes ahead, on the CPU.
     """
 
-    def __init__(self, cache: MemoryCache, folder: Path | None, prepare: Callable[[Gaussians], Structure | None]):
-        self._cache, self._folder, self._prepare = cache, folder, prepare
+    def __init__(
+        self,
+        cache: MemoryCache,
+        folder: Path | None,
+        prepare: Callable[[Gaussians], Structure | None],
+        background: Background,
+    ):
+        self._cache, self._folder, self._prepare, self._background = cache, folder, prepare, background
         self._latest: tuple[PrunedKey, PrunedScene] | None = None
+
+    def start(self, scene: DenseScene, settings: PruneSettings) -> None:
+        """Prune a scene in the background, unless it is in memory. An error is raised by :meth:`get`."""
+        key = PrunedKey(scene.name, settings)
+        if (self._latest is None or self._latest[0] != key) and self._cache.get(key) is None:
+            self._background.start(key, functools.partial(self._read_or_prune, scene, settings))
 
     def get(
         self,
@@ -74,31 +90,33 @@ class PrunedScenes:
         if self._latest is None or self._latest[0] != key:
             pruned = self._cache.get(key)
             if pruned is None:
-                pruned = self._make(scene, settings, device, dense)
+                make = functools.partial(self._read_or_prune, scene, settings, dense)
+                smaller, dense_count, seconds = self._background.take(key, make)
+                CONSOLE.log(f"{scene.name}: kept {len(smaller):,} of {dense_count:,} Gaussians")
+                smaller = smaller.to(device)
+                pruned = PrunedScene(dense_count, smaller, self._prepare(smaller), seconds)
                 self._cache.put(key, pruned, sum(tensor.nbytes for tensor in tensors_in(pruned)))
             self._latest = key, pruned
         return self._latest[1]
 
-    def _make(
-        self, scene: DenseScene, settings: PruneSettings, device: torch.device | str, dense: Gaussians | None
-    ) -> PrunedScene:
-        """Read a pruned scene from the folder, or prune the scene now and save it there."""
+    def _read_or_prune(
+        self, scene: DenseScene, settings: PruneSettings, dense: Gaussians | None = None
+    ) -> tuple[Gaussians, int, float]:
+        """Read a pruned scene from the folder, or prune the scene now and save it there. The pruned scene on the CPU,
+        the number of Gaussians of the dense one, and the seconds that pruning took."""
         stored = None if self._folder is None else stored_path(self._folder, scene.name, scene.content, settings)
         if stored is not None and stored.is_file():
-            pruned, dense_count, seconds = read_pruned(stored)
-        else:
-            dense = scene.dense(keep=False) if dense is None else dense
-            start = time.perf_counter()
-            try:
-                pruned = settings.prune(dense)
-            except PointSplatError as error:
-                raise type(error)(f"{scene.source}: {error}") from error
-            dense_count, seconds = len(dense), time.perf_counter() - start
-            if stored is not None:
-                write_pruned(stored, pruned, dense_count, seconds)
-        CONSOLE.log(f"{scene.name}: kept {len(pruned):,} of {dense_count:,} Gaussians")
-        pruned = pruned.to(device)
-        return PrunedScene(dense_count, pruned, self._prepare(pruned), seconds)
+            return read_pruned(stored)
+        dense = scene.dense(keep=False) if dense is None else dense
+        start = time.perf_counter()
+        try:
+            pruned = settings.prune(dense, self._background.check)
+        except PointSplatError as error:
+            raise type(error)(f"{scene.source}: {error}") from error
+        dense_count, seconds = len(dense), time.perf_counter() - start
+        if stored is not None:
+            write_pruned(stored, pruned, dense_count, seconds)
+        return pruned, dense_count, seconds
 
 
 def tensors_in(value: Any) -> Iterator[Tensor]:

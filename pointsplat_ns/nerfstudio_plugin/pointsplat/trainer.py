@@ -185,6 +185,18 @@ class PointSplatTrainer(StoppableTrainer):
         self.step = min(self.step, self._last_step)
         super()._after_train()
 
+    def train(self) -> None:
+        """As nerfstudio's. The first step waits for its scene alone."""
+        manager = self.pipeline.datamanager
+        if processes.rank() == 0 and len(manager.train_indices) > 1:
+            name = manager.scenes[manager.scene_at(self._start_step)].name
+            CONSOLE.log(f"preparing {name} for the first step, then the other scenes while steps are taken")
+        super().train()
+
+    def end_background(self) -> None:
+        """End the preparation of further scenes."""
+        self.pipeline.datamanager.background.stop()
+
     def _faults_of_gradients(self) -> list[str]:
         """One text for each part of the network with a gradient that is not finite."""
         faults = []
