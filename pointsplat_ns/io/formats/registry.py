@@ -176,8 +176,10 @@ def _told_by_content(path: Path, start: bytes) -> Format | None:
         return _told_by_zip(path)
     kind = next((kind for kind in FORMATS if start.startswith(kind.starts)), None)
     if kind is not None and kind.starts == _PLY:
-        with suppress(SceneError), path.open("rb") as stream:  # what is damaged, its reader says
-            return FORMATS[0 if is_compressed(read_header(stream, path)) else 1]
+        compressed, plain = FORMATS[:2]
+        with suppress(SceneError), path.open("rb") as stream:
+            return compressed if is_compressed(read_header(stream, path)) else plain
+        return plain  # with a damaged header, which its reader says
     return kind
 
 
