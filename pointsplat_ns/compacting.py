@@ -109,8 +109,11 @@ def compact_source(
     with progress_bar(progress) as report:
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
+            from pointsplat_ns.compression.posed_scene import check_photos
 
             photos = None if request.photos is None else _training_photos(run_of(scene, None), data)
+            if photos is not None:
+                check_photos(dense, photos, str(scene))
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
-from pointsplat_ns.compression.posed_scene import check_views_show, views_for
+from pointsplat_ns.compression.posed_scene import PosesFile
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import coarser_levels
@@ -98,12 +98,14 @@ def render_path(
     kind = check_output(output, force)
     need_named_data(scene, data)
     sources = [scene] if other is None else [scene, other]
-    given = views_for(scene, views).resized(CAMERA_PATH.photo_side) if isinstance(views, (str, Path)) else views
+    poses = PosesFile.of(scene, views) if isinstance(views, (str, Path)) else None
+    given = views if isinstance(views, Views) else None
     loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
     loaded = [one.at_offset(loaded[0].offset) for one in loaded]
-    if given is not None and isinstance(views, (str, Path)):
-        given = given.relative_to(loaded[0].offset)
-        check_views_show(loaded[0], given, views)
+    if poses is not None:
+        poses = poses.relative_to(loaded[0].offset)
+        poses.check(loaded[0])
+        given = poses.views.resized(CAMERA_PATH.photo_side)
     way: str | Path = path if not isinstance(path, Views) else "dataset"
     if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
         settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))

@@ -2,67 +2,101 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.io.camera_files import read_views, transforms_beside
+from pointsplat_ns.io.camera_files import NamedViews, read_named_views, transforms_beside
+from pointsplat_ns.io.pictures import read_reduced
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.looking.poses import in_pictures
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.views import Views
+from pointsplat_ns.looking.pose_check import POSE_CHECK, Photo, likeness, pose_faults
+from pointsplat_ns.views import Views, spread_indices
 
 
 def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
     """Read a scene and its views. The file of cameras is read first; then both are checked against each other. Errors
-    are those of :func:`views_for`, :func:`~pointsplat_ns.io.read_scene` and :func:`check_views_show`."""
-    views = views_for(scene, poses)
+    are those of :meth:`PosesFile.of`, :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
+    found = PosesFile.of(scene, poses)
     dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
-    views = views.relative_to(dense.offset)
-    check_views_show(dense, views, poses)
-    return dense, views
+    found = found.relative_to(dense.offset)
+    found.check(dense)
+    return dense, found.views
 
 
-def views_for(scene: Gaussians | Path | str, poses: Path | str) -> Views:
-    """Read the views of a scene from a file of cameras, of at most 1600 pixels on the longer side, as in 3DGS training.
-    They are in the frame of the scene's file: :meth:`~pointsplat_ns.views.Views.relative_to` brings them to its offset.
+@dataclass(frozen=True, eq=False)
+class PosesFile:
+    """Views of a scene from a file of cameras."""
 
-    A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
-    scene's frame. Raises SceneError if a file is missing, or the
-    transforms are not usable, and DataError if the file has no usable cameras.
-    """
-    transforms = None if isinstance(scene, Gaussians) else _transforms_of(Path(scene))
-    return read_views(poses, transforms).resized(1600)
+    path: Path
+    views: Views
+    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the longer side, as in 3DGS
+    training."""
+    named: NamedViews
+    transforms: Path | None
+    """What moved them into the frame of the scene, unless the file's frame is no dataset's."""
+
+    @staticmethod
+    def of(scene: Gaussians | Path | str, poses: Path | str) -> PosesFile:
+        """Read the views of a scene from a file of cameras.
+
+        A ``dataparser_transforms.json`` in the scene's run, beside the scene or beside the poses moves them into the
+        scene's frame. Raises SceneError if a file is missing, or the transforms are not usable, and DataError if the
+        file has no usable cameras.
+        """
+        transforms = None if isinstance(scene, Gaussians) else _transforms_of(Path(scene))
+        transforms = transforms or transforms_beside(poses)
+        named = read_named_views(poses, transforms)
+        return PosesFile(Path(poses), named.views.resized(1600), named, transforms)
+
+    def relative_to(self, offset: tuple[float, float, float] | None) -> PosesFile:
+        """The same for a scene whose positions are relative to an offset, scene units."""
+        return replace(self, views=self.views.relative_to(offset))
+
+    def check(self, scene: Gaussians) -> None:
+        """Check by small renders, and by the photos that lie where the file says, that the views belong to a scene, to
+        whose offset they are relative.
+
+        Raises:
+            DataError: if most views show nothing of the scene, or nothing sharp, or renders are not like the photos. A
+                scene without a visible Gaussian is not refused here.
+        """
+        wrong = pose_faults(scene, self.views).text or likeness(scene, self._photos()).text()
+        if not wrong:
+            return
+        mend = (
+            "nerfstudio moves and scales scenes, and its run says how in dataparser_transforms.json; put that file "
+            "beside the scene, or write the scene in the frame of its data (pointsplat convert RUN --original-frame)"
+        )
+        if self.transforms is not None:
+            mend = (
+                f"{self.transforms} is of another run, or the scene was moved since its training; write the scene "
+                "again from its run"
+            )
+        raise DataError(f"{self.path}: {wrong}; poses and scene are probably in different frames: {mend}")
+
+    def _photos(self) -> list[Photo]:
+        """Photos of some of the views, those that lie where the file says and have the shape of their picture."""
+        found: list[Photo] = []
+        for index in spread_indices(len(self.views), POSE_CHECK.views):
+            file, view = self.named.photo(index), self.views[index]
+            photo = None if file is None else read_reduced(file, POSE_CHECK.side)
+            # One of another shape is cut, or turned by EXIF.
+            if photo is not None and abs(photo.shape[1] * view.height / (photo.shape[0] * view.width) - 1) < 0.05:
+                found.append((view, photo, None))
+        return found
 
 
-def check_views_show(scene: Gaussians, views: Views, poses: Path | str) -> None:
-    """Raise a DataError, with the path ``poses`` of the cameras, if fewer than half of the views show the scene.
-
-    A view shows the scene if a visible Gaussian is in the picture, and the content is at least 2 % as wide as the
-    picture: many a distant camera has a dot of the scene in its picture. The content leaves out 5 % of the Gaussians at
-    each end of each axis, because far floaters are in the picture of nearly any camera. An even choice of up to 4096
-    Gaussians and 256 cameras is checked. A scene without a visible Gaussian is not refused here.
-    """
-    visible = (scene.usable() & (scene.alphas >= ALPHA_MIN)).nonzero()[:, 0]
-    means = scene.means[visible[:: max(1, len(visible) // 4096)]].double().cpu()
-    if len(means) == 0:
-        return
-    low, high = (torch.quantile(means, share, dim=0, interpolation="nearest") for share in (0.05, 0.95))
-    means = means[((means >= low) & (means <= high)).all(1)]
-    checked = views.spread(256)
-    distances = (invert_rigid(checked.viewmats.double())[:, :3, 3] - 0.5 * (low + high)).norm(dim=1)
-    across = checked.Ks[:, 0, 0].double() * (high - low).norm()  # pixels, at a distance of 1
-    large = (across >= 0.02 * checked.width * distances) | bool((low == high).all())
-    showing = int((in_pictures(checked, means).any(1) & large).sum())
-    if 2 * showing < len(checked):
+def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) -> None:
+    """Raise a DataError if renders of a scene are not like the photos of its training, a few of which are read;
+    ``data`` is the path of these."""
+    some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
+    if wrong := likeness(scene, some).text():
         raise DataError(
-            f"{poses}: {showing} of {len(checked)} cameras see anything of the scene; expected at least half; poses "
-            "and scene are probably in different frames: nerfstudio moves and scales scenes, and its run says how in "
-            "dataparser_transforms.json; put that file beside the scene"
+            f"{data}: {wrong}; the photos or their poses are probably not those of the training: put back the data as "
+            "it was, or name the folder where it is now (--data DIR)"
         )
 
 

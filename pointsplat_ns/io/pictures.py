@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,6 +39,21 @@ def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
         f"; its EXIF orientation ({orientation}) says that it is to be turned, and the camera is that of the turned "
         "photo: turn the photos themselves, for example with mogrify -auto-orient *.jpg"
     )
+
+
+def read_reduced(path: Path, side: int) -> Tensor | None:
+    """An image file, reduced until its longer side is about ``side`` pixels: (H, W, 3) float32 in [0, 1], transparency
+    over black; None if it cannot be read."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            opened.draft("RGB", (side, side))  # JPEGs are decoded at an eighth of their size
+            opened.thumbnail((side, side), Image.Resampling.BOX)
+            image = torch.from_numpy(np.asarray(opened.convert("RGBA"), dtype=np.float32) / 255)
+    except (OSError, ValueError, SyntaxError, MemoryError, Image.DecompressionBombError):
+        return None
+    return image[..., :3] * image[..., 3:]
 
 
 def write_picture(picture: Tensor, path: Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
+from pointsplat_ns.compression.posed_scene import check_photos
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
@@ -95,14 +96,17 @@ def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:
 
 
 def need_named_data(scene: object, data: Path | str | None) -> None:
-    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no path of a run, or the
-    poses cannot be read there. Where nothing is named, data that is missing is no error."""
+    """If the data of a run is named, check that it serves: a PointSplatError if ``scene`` is no path of a run, the
+    poses cannot be read there, or photos are not like renders. Where nothing is named, data that is missing is no
+    error."""
     if data is None:
         return
     if not isinstance(scene, (str, Path)) or not may_be_run(scene):
         what = scene if isinstance(scene, (str, Path)) else "a scene in memory"
         raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
-    dataset_views(scene, data=data)
+    trained, frames = _open(scene, "train", data)
+    _views_of(trained, frames, "train")
+    check_photos(trained.read_dense(), TrainingPhotos(trained, frames), data)
 
 
 class TrainingPhotos(Sequence[Example]):

@@ -6,7 +6,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import read_posed
+from pointsplat_ns.compression.posed_scene import check_photos, read_posed
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
@@ -122,6 +122,8 @@ def measure_tradeoff(
         subject = subject_of(dense, path, given, resolution=size, up=upward, data=data)
         file = None if poses is None else Path(poses)
         training = training_photos(path, data) if on_photos else None
+        if training is not None:
+            check_photos(dense, training, path)
         subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file, training=training)
         sweep = Sweep(subject, folder, options, report)
         if targets is None:

@@ -11,16 +11,18 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, cloud, run_of
+from making import SHARED_DATA, ball, cloud, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.placing import run_frame
-from pointsplat_ns.compression.posed_scene import check_views_show, read_posed
+from pointsplat_ns.compression.posed_scene import PosesFile, read_posed
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.io.camera_files import read_named_views
+from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.upright import axis_named
-from posing import inria, nerfstudio, written
+from posing import inria, name_of, nerfstudio, write_colmap_text, written
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +92,78 @@ def test_large_pictures_are_reduced(scene, views, tmp_path):
 
 
 @pytest.mark.parametrize("nothing", [0, 3])
-def test_a_scene_of_which_nothing_is_visible_is_left_to_others(nothing, scene, views):
-    check_views_show(scene[:nothing].replace(opacities=scene.opacities[:nothing] * 0 - 30), views, "a.json")
+def test_a_scene_of_which_nothing_is_visible_is_left_to_others(nothing, scene, views, tmp_path):
+    path = written(inria(views), tmp_path / "cameras.json")
+    invisible = scene[:nothing].replace(opacities=scene.opacities[:nothing] * 0 - 30)
+    PosesFile.of(invisible, path).check(invisible)
+
+
+def turned_about(views: ps.Views) -> ps.Views:
+    """Cameras in another frame, whose x, y and z are the scene's y, z and x."""
+    turn = torch.eye(4, dtype=torch.float64)[[1, 2, 0, 3]]
+    return replace(views, viewmats=views.viewmats.double() @ turn)
+
+
+def write_photos(scene: Gaussians, views: ps.Views, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for index, view in enumerate(views):
+        write_picture(ps.render(scene, view), folder / name_of(index))
+
+
+@pytest.mark.parametrize("layout", ["nerfstudio", "scannet++", "colmap"])
+def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, views, tmp_path):
+    """From inside a ball every frame shows it, sharp: photos alone tell."""
+    photos = {"scannet++": tmp_path / "dslr" / "resized_images"}.get(layout, tmp_path / "images")
+    write_photos(scene, views, photos)
+
+    def poses_of(views: ps.Views) -> Path:
+        if layout == "colmap":
+            return write_colmap_text(views, tmp_path / "sparse" / "0")
+        content = nerfstudio(views)
+        if layout == "nerfstudio":
+            return written(content, tmp_path / "transforms.json")
+        for frame in content["frames"]:
+            frame["file_path"] = Path(frame["file_path"]).name
+        (tmp_path / "dslr" / "nerfstudio").mkdir(exist_ok=True)
+        return written(content, tmp_path / "dslr" / "nerfstudio" / "transforms.json")
+
+    _, found = read_posed(scene, poses_of(views))
+    assert len(found) == len(views)
+    with pytest.raises(
+        ps.DataError, match=r"no more like the photos of their views than like others \(.* dB PSNR in 6"
+    ):
+        read_posed(scene, poses_of(turned_about(views)))
+    for photo in photos.iterdir():
+        photo.write_bytes(b"no photo")
+    read_posed(scene, poses_of(turned_about(views)))  # nothing to compare with
+
+
+def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_path):
+    write_photos(scene, views, tmp_path / "images")
+    content = nerfstudio(turned_about(views))
+    (tmp_path / "in").mkdir()
+    for frame in content["frames"]:
+        frame["file_path"] = f"../{frame['file_path']}"
+    found = read_named_views(written(content, tmp_path / "in" / "transforms.json"))
+    assert [found.photo(index) for index in range(6)] == [None] * 6
+
+
+FOX_RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
+FOX_POSES = SHARED_DATA / "scannetpp" / "fox" / "dslr" / "nerfstudio" / "transforms.json"
+
+
+@pytest.mark.skipif(not (FOX_RUN.exists() and FOX_POSES.exists()), reason="no real run at hand")
+def test_an_export_of_nerfstudio_needs_the_transforms_of_its_run(tmp_path):
+    ps.save(ps.load(FOX_RUN), tmp_path / "fox.ply")
+    alone = shutil.copy(FOX_POSES, tmp_path / "transforms.json")  # without its photos
+    for poses in (alone, FOX_POSES):
+        with pytest.raises(ps.DataError, match=r"transforms.json: .*put that file beside the scene.*--original-frame"):
+            read_posed(tmp_path / "fox.ply", poses)
+    shutil.copy(FOX_RUN / "dataparser_transforms.json", tmp_path)
+    for poses in (alone, FOX_POSES):
+        assert len(read_posed(tmp_path / "fox.ply", poses)[1]) == 45
+    with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
+        read_posed(ps.load(FOX_RUN).replace(means=ps.load(FOX_RUN).means + 30.0), alone)
 
 
 SEED = 4

@@ -3,6 +3,13 @@
 Every file may come from a stranger: it is read within limits, and refused in one line.
 """
 
-from pointsplat_ns.io.camera_files.registry import CAMERA_KINDS, is_camera_file, read_views, transforms_beside
+from pointsplat_ns.io.camera_files.registry import (
+    CAMERA_KINDS,
+    NamedViews,
+    is_camera_file,
+    read_named_views,
+    read_views,
+    transforms_beside,
+)
 
-__all__ = ["CAMERA_KINDS", "is_camera_file", "read_views", "transforms_beside"]
+__all__ = ["CAMERA_KINDS", "NamedViews", "is_camera_file", "read_named_views", "read_views", "transforms_beside"]

@@ -180,10 +180,17 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     stretch = sizes.new_tensor([width, height]) / sizes
     Ks = torch.eye(3, **DOUBLES).repeat(len(cameras), 1, 1)
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = focals * stretch, centres * stretch
-    order = list(range(len(cameras)))
-    if all(names):  # digits count as numbers
-        order.sort(key=lambda index: re.sub(r"\d+", lambda digits: digits[0].zfill(20), names[index]))
+    order = photo_order(names)
     return Views(invert_rigid(poses)[order], Ks[order], width, height, torch.zeros(3, **FLOATS))
+
+
+def photo_order(names: Sequence[str]) -> list[int]:
+    """Indices of cameras in the order of the names of their photos, digits counted as numbers; as they are if one has
+    no name."""
+    order = list(range(len(names)))
+    if all(names):
+        order.sort(key=lambda index: re.sub(r"\d+", lambda digits: digits[0].zfill(20), names[index]))
+    return order
 
 
 def need_count(path: Path, count: int) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, rigid
+from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, photo_order, rigid
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
 from pointsplat_ns.io.camera_files.inria import inria_cameras
 from pointsplat_ns.io.camera_files.nerfstudio import exported_cameras, nerfstudio_cameras
@@ -19,6 +22,28 @@ CAMERA_KINDS = (
     "cameras.json of 3DGS, transforms.json of nerfstudio, transforms_train.json of ns-export cameras, or the folder of "
     "a COLMAP model or project"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class NamedViews:
+    """Views of a file of cameras, and where their photos may lie."""
+
+    views: Views
+    names: Sequence[str]
+    """Of the photo of each view, as the file has it; empty if it has none."""
+    folders: Sequence[Path]
+    """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model in the folders
+    ``images`` of the project."""
+
+    def photo(self, index: int) -> Path | None:
+        """The photo of a view; None if it does not lie in one of the folders or below."""
+        relative = PurePosixPath(self.names[index] if "\0" not in self.names[index] else "")
+        if not relative.name or relative.is_absolute() or ".." in relative.parts:  # nothing outside is opened
+            return None
+        found = (folder / f"{relative}{suffix}" for folder in self.folders for suffix in ("", ".png"))
+        with suppress(OSError):
+            return next((file for file in found if file.is_file()), None)
+        return None
 
 
 def is_camera_file(path: Path | str) -> bool:
@@ -69,15 +94,26 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
         >>> len(views), views.width, views.height
         (1, 64, 48)
     """
+    return read_named_views(path, transforms).views
+
+
+def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
+    """As :func:`read_views`, with where the photos may lie."""
     path = Path(path)
-    found = colmap_cameras(path) if model_folder(path) else _json_cameras(path)
-    transforms = transforms or transforms_beside(path)
-    if found.saved is None or transforms is None:
-        return checked_views(path, found.cameras)
-    transform, scale = read_transforms(transforms)
-    exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
-    logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
-    return checked_views(path, found.cameras, found.saved.undone_before(Motion(exact, scale)))
+    model = model_folder(path)
+    found = _json_cameras(path) if model is None else colmap_cameras(path)
+    folders = [path.parent, path.absolute().parent.parent / "resized_images"]
+    if model is not None:
+        folders = [above / "images" for above in (model, *model.absolute().parents[:3])]
+    motion, transforms = None, transforms or transforms_beside(path)
+    if found.saved is not None and transforms is not None:
+        transform, scale = read_transforms(transforms)
+        exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
+        logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
+        motion = found.saved.undone_before(Motion(exact, scale))
+    names = [camera.name for camera in found.cameras]
+    views = checked_views(path, found.cameras, motion)
+    return NamedViews(views, [names[index] for index in photo_order(names)], folders)
 
 
 def _json_cameras(path: Path) -> CameraFile:
