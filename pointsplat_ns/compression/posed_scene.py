@@ -32,8 +32,8 @@ class PosesFile:
 
     path: Path
     views: Views
-    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the longer side, as in 3DGS
-    training."""
+    """In the frame of the scene's file, or relative to its offset; of at most 1600 pixels on the longer side, as in
+    3DGS training."""
     named: NamedViews
     transforms: Path | None
     """What moved them into the frame of the scene, unless the file's frame is no dataset's."""
