@@ -213,3 +213,10 @@ ps.save(result.scene, {str(tmp_path / "small.ply")!r})
 def test_neither_the_lab_nor_tests_nor_mocks_are_imported_by_the_package():
     names = {name.split(".")[0] for path in PACKAGE.rglob("*.py") for name in imports_of(path)}
     assert names & {"lab", "tests", "making", "unittest", "mock", "pytest"} == set()
+
+
+def test_tests_that_ci_names_are_there():
+    """pytest runs none if one of its paths is missing."""
+    words = (REPOSITORY / ".github" / "workflows" / "ci.yml").read_text("utf-8").replace('"', " ").split()
+    named = {word.partition("::")[0] for word in words if word.startswith("tests/")}
+    assert len(named) > 10 and [name for name in named if not (REPOSITORY / name).exists()] == []

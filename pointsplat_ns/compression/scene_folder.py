@@ -194,7 +194,7 @@ def _check_and_describe(output: Path, command: Command, force: bool) -> None:
                     "them with --force"
                 )
             if known != description:
-                with replacing(path) as part:
+                with replacing(path, named=False) as part:
                     part.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise SceneError(f"{output}: cannot be used ({error.strerror or error})") from error

@@ -223,7 +223,7 @@ def _write(task: SceneTask, made: SmallerScene, key: str, options: CommandOption
 
 def _write_record(task: SceneTask, result: SceneResult, proofs: Mapping[str, Any]) -> None:
     facts = {name: value for name, value in dataclasses.asdict(result).items() if name not in ("name", "output")}
-    with replacing(task.record) as part:
+    with replacing(task.record, named=False) as part:
         part.write_text(json.dumps({**facts, **proofs}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -124,7 +124,7 @@ def file_stem(text: str) -> str:
 
 
 @contextmanager
-def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> Iterator[Path]:
+def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to. It replaces ``path`` when the block ends without an error, else it
     is removed.
 
@@ -136,6 +136,8 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
         path: the file.
         size: bytes that will be written, if that is known; they must be free.
         folder: where the temporary path is instead, on the same file system.
+        named: whether a person named the file. If not, a symbolic link there is replaced itself: somebody else made it,
+            as in a folder that came from elsewhere.
 
     Raises:
         SceneError: if ``path`` is a folder or a device, or cannot be written.
@@ -143,8 +145,9 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None) -> It
     path = Path(path)
     part: Path | None = None
     try:
-        target = target_of(path)
-        mode = _mode_of(target)
+        foreign = not named and path.is_symlink()
+        target = path if foreign else target_of(path)
+        mode = None if foreign else _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         require_space(path, target.parent, size)
         part = (folder or target.parent) / _part_name(target.name)
@@ -284,8 +287,8 @@ def json_text(content: Any) -> str:
 
 
 def write_json(content: Any, path: Path | str) -> None:
-    """Write JSON as :func:`json_text` has it, as :func:`replacing` does."""
-    with replacing(path) as part:
+    """Write JSON as :func:`json_text` has it, as :func:`replacing` writes what no person named."""
+    with replacing(path, named=False) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")
 
 

@@ -40,9 +40,9 @@ def write_tables(folder: Path, shares: Sequence[float], missing: Mapping[str, st
         if found := medians(group):
             tables[group.name].append(figure_medians(group, found))
     write_json(_content(groups, missing), folder / TABLE_FILES.json)
-    with replacing(folder / TABLE_FILES.markdown) as part:
+    with replacing(folder / TABLE_FILES.markdown, named=False) as part:
         part.write_text(_markdown(groups, tables), encoding="utf-8")
-    with replacing(folder / TABLE_FILES.latex) as part:
+    with replacing(folder / TABLE_FILES.latex, named=False) as part:
         every = [table for members in tables.values() for table in members]
         part.write_text(latex_document(every, [READING.replace("\\", ""), *_notes(groups)]), encoding="utf-8")
     plot_figure(groups, folder / TABLE_FILES.figure)
@@ -164,7 +164,7 @@ def plot_figure(groups: Sequence[Group], path: Path) -> None:
     drawn = [axis for axis in figure.axes if axis.has_data()]
     if drawn:
         figure.legend(*drawn[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8)
-    with replacing(path) as part:
+    with replacing(path, named=False) as part:
         figure.savefig(part, dpi=110, format="png")
 
 

@@ -82,7 +82,7 @@ def plot(sweep: Tradeoff, cost: Cost, path: Path) -> None:
         _draw(axis, sweep, cost, reference)
         axis.set_title(title, fontsize=10)
     figure.suptitle(f"{sweep.scene}, {sweep.width} x {sweep.height} pixels\n{sweep.machine}", fontsize=9)
-    with replacing(path) as part:
+    with replacing(path, named=False) as part:
         figure.savefig(part, dpi=150, format="png")
 
 

@@ -24,3 +24,14 @@ def test_the_table_of_a_folder_holds_no_formula_of_a_file_name(tmp_path):
     assert result.name == name
     with (tmp_path / "out" / "scenes.csv").open(newline="") as stream:
         assert [row["name"] for row in csv.DictReader(stream)] == [f"'{name}"]
+
+
+def test_links_among_the_tables_of_a_folder_are_replaced_and_not_written_through(tmp_path):
+    ps.save(normal_scene(4), tmp_path / "in" / "a.ply")
+    (tmp_path / "diary.txt").write_text("precious")
+    (tmp_path / "out").mkdir()
+    for name in ("scenes.csv", "a.ply.json"):
+        (tmp_path / "out" / name).symlink_to(tmp_path / "diary.txt")
+    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
+    assert result.status == "done" and (tmp_path / "diary.txt").read_text() == "precious"
+    assert not any(path.is_symlink() for path in (tmp_path / "out").iterdir())
