@@ -33,7 +33,7 @@ def test_ctrl_c_while_the_program_is_imported_is_one_word(name):
 def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
     code = "import sys; before = {*sys.modules}; import pointsplat_ns.start; print(*sorted({*sys.modules} - before))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    by_python = {"importlib", "importlib._bootstrap", "importlib._bootstrap_external", "warnings"}
+    by_python = {"__future__", "importlib", "importlib._bootstrap", "importlib._bootstrap_external", "warnings"}
     assert {*done.stdout.split()} - by_python == {"pointsplat_ns", "pointsplat_ns.start"}
 
 
