@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-    from pointsplat_ns.nerfstudio_plugin.measure_tables import measure_tables
     from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import measure_tradeoff
     from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
     from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
@@ -69,7 +68,6 @@ _PUBLIC = {
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
-    "pointsplat_ns.nerfstudio_plugin.measure_tables": ("measure_tables",),
     "pointsplat_ns.nerfstudio_plugin.measure_tradeoff": ("measure_tradeoff",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner": ("make_refiner",),
     "pointsplat_ns.nerfstudio_plugin.pointsplat.report": ("report",),
@@ -107,7 +105,6 @@ __all__ = [
     "lod",
     "lpips",
     "make_refiner",
-    "measure_tables",
     "measure_tradeoff",
     "open_viewer",
     "place",

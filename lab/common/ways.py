@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from pointsplat_ns.tables.making import Reducer, SplatTransform
+from lab.tables.making import Reducer, SplatTransform
 
 Way = Literal["prune", "compact", "thorough"]
 

@@ -28,13 +28,13 @@ from lab.common.ways import Way, count_of, programs_of
 from lab.judge.camera_paths import path_of, write_sheet
 from lab.judge.scenes import MEASURES, JudgedScene, check, load, losses
 from lab.judge.tables import COSTS, lead_tables, mean_tables, ordered, scene_list, scene_table, summaries
+from lab.tables.making import Reducer
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.system.programs import ProgramFailed
 from pointsplat_ns.system.progress import tracked
-from pointsplat_ns.tables.making import Reducer
 
 LEAST_WIDTH = 20
 """Pixels: a lower picture is smaller than SSIM's window."""

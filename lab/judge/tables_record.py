@@ -1,4 +1,4 @@
-"""Writes docs/record/results.md and its figure from what ``pointsplat tables`` measured.
+"""Writes docs/record/results.md and its figure from what ``python -m lab.tables`` measured.
 
     python -m lab.judge.tables_record docs/record/results.json
 
@@ -17,12 +17,12 @@ import tyro
 
 from lab.common.printing import markdown, start
 from lab.judge import refiners
+from lab.tables.cells import About, Cell
+from lab.tables.layout import Layout, Table, figure_medians, markdown_table
+from lab.tables.means import Group, SceneCells
+from lab.tables.outputs import medians, plot_figure
+from lab.tables.ways import WAYS
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tables.cells import About, Cell
-from pointsplat_ns.tables.layout import Layout, Table, figure_medians, markdown_table
-from pointsplat_ns.tables.means import Group, SceneCells
-from pointsplat_ns.tables.outputs import medians, plot_figure
-from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.journal import restored_point
 
 ROOT = Path(__file__).parents[2]
@@ -38,10 +38,10 @@ FIGURE = "results_figure4.png"
 PAGE = """# The paper's networks and scores on two rooms
 
 `lab/judge/tables_record.py` writes this page from [results.json](results.json), which
-[`pointsplat tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
+[`python -m lab.tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
 
 ```bash
-pointsplat tables outputs/room52 outputs/room53 -o results --views 5 --side 320 --scoring-views 12 \\
+python -m lab.tables outputs/room52 outputs/room53 -o results --views 5 --side 320 --scoring-views 12 \\
     --fine-tune 60 --refiners refiners/dual-010 refiners/dual-030 refiners/concat-010 refiners/concat-030 \\
     --groups rooms=room52,room53
 ```
@@ -76,7 +76,7 @@ ns-train pointsplat --data scenes --pipeline.datamanager.supervision dense --pip
 
 
 def read(path: Path) -> list[Group]:
-    """The groups of scenes of a file that ``pointsplat tables`` wrote, without the cells of ``prune`` and ``compact``.
+    """The groups of scenes of a file that lab.tables wrote, without the cells of ``prune`` and ``compact``.
 
     Raises:
         SystemExit: if the file cannot be read or is none.
@@ -90,7 +90,9 @@ def read(path: Path) -> list[Group]:
             own = {(cell.way, cell.point.share): cell for cell in cells if cell.point.key.startswith(f"{about.name}/")}
             scenes[about.group].append(SceneCells(about, own))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SystemExit(f"{path}: cannot be read ({error!r}); expected tables.json of `pointsplat tables`") from error
+        raise SystemExit(
+            f"{path}: cannot be read ({error!r}); expected tables.json of `python -m lab.tables`"
+        ) from error
     return [Group(name, tuple(members)) for name, members in scenes.items()]
 
 
@@ -136,7 +138,7 @@ def main(file: tyro.conf.Positional[Path], record: Path = ROOT / "docs" / "recor
     """Write the record of the paper's tables.
 
     Args:
-        file: tables.json of ``pointsplat tables``.
+        file: tables.json of ``python -m lab.tables``.
         record: folder for results.md and its figure.
     """
     groups = read(file)

@@ -26,10 +26,10 @@ from lab.common.results import Row, grouped, write_json
 from lab.common.scenes import KEEP, room
 from lab.common.timing import slope
 from lab.common.ways import WAYS, Way, count_of, programs_of
+from lab.tables.making import Reducer
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.programs import ProgramFailed, run_measured
-from pointsplat_ns.tables.making import Reducer
 
 START = 1000
 """Gaussians of the scene that shows what starting a program costs."""

@@ -26,7 +26,6 @@ COMMANDS = (
         "compact",
         "lod",
         "tradeoff",
-        "tables",
         "convert",
         "info",
         "view",

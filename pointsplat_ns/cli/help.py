@@ -24,10 +24,6 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
         ("the smallest scene of 32 dB", "pointsplat tradeoff room.ply --target-db 32 --json"),
     ),
-    "tables": (
-        ("the paper's tables of two scenes", "pointsplat tables kitchen.ply room.ply -o tables"),
-        ("one cell again", "pointsplat tables room.ply -o tables --only room/merge/10%"),
-    ),
     "convert": (
         ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
         ("a run, in the frame of its photos' poses", "pointsplat convert outputs/room room.ply --original-frame"),

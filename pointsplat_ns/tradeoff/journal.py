@@ -1,6 +1,6 @@
 """Journals: every record is written as soon as it is measured, so that an interrupted command can continue.
 
-``points.json`` is the journal of a sweep; :mod:`pointsplat_ns.tables` keeps its cells in files of the same form.
+``points.json`` is the journal of a sweep; the lab keeps the cells of its tables in files of the same form.
 """
 
 from __future__ import annotations

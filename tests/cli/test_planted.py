@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
+from lab.tables.making import SplatTransform
 from making import normal_scene
-from pointsplat_ns.tables.making import SplatTransform
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -9,6 +9,7 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 import pointsplat_ns as ps
+from lab.tables.measure import measure_tables
 from making import run_of, without_data
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import SceneError
@@ -76,7 +77,7 @@ def test_tables_and_viewer_find_the_data_too(runs, moved, tmp_path):
     run = run_of(runs, "wall-b")
     with ps.open_viewer(run, port=0, data=moved) as viewer:
         assert "no dataset" not in viewer.origin
-    [group] = ps.measure_tables([run], tmp_path / "t", only=["wall-b/paper/10%"], views=2, side=64, data=moved)
+    [group] = measure_tables([run], tmp_path / "t", only=["wall-b/paper/10%"], views=2, side=64, data=moved)
     assert group.scenes[0].about.origin == "held-out photos"
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
+from lab.tables import measure as measure_tables
+from lab.tables import outputs
+from lab.tables.measure import paper_dataset
 from making import ball, write_run
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.nerfstudio_plugin import measure_tables
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
-from pointsplat_ns.nerfstudio_plugin.measure_tables import paper_dataset
 from pointsplat_ns.nerfstudio_plugin.running import has_finished, remove_interrupted
-from pointsplat_ns.tables import outputs
 from pointsplat_ns.tradeoff import machine
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
@@ -39,7 +39,7 @@ def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     (config,) = (trained_walls / "wall-b").rglob("config.yml")
     only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]
-    [group] = ps.measure_tables([config.parent], tmp_path / "tables", only=only, fine_tune=8)
+    [group] = measure_tables.measure_tables([config.parent], tmp_path / "tables", only=only, fine_tune=8)
     [scene] = group.scenes
     views, photos = dataset_photos(config.parent, "test", 10)
     dense = ps.load(config.parent)

@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from pointsplat_ns.tables.cells import BINS, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import WAYS, Way, cell_key
+from lab.tables.cells import BINS, About, Cell, CellJournal
+from lab.tables.ways import WAYS, Way, cell_key
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 
 IDENTITY = {"file": "abc", "machine": "a machine", "most views": 3}
@@ -22,7 +22,7 @@ def cell(name: str, way: Way, share: float, psnr: float, photos: float | None) -
     point = Point(
         key=cell_key(name, way, share),
         label=way.label,
-        command=f"pointsplat tables outputs/{name} -o tables --only {cell_key(name, way, share)}",
+        command=f"python -m lab.tables outputs/{name} -o tables --only {cell_key(name, way, share)}",
         by=way.by or way.name,
         share=share,
         gaussians=round(1000 * share),

@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lab.tables import outputs
+from lab.tables.cells import BINS, TABLE_FILES, CellJournal, distributions
+from lab.tables.layout import Layout, Table, latex_table, markdown_table
+from lab.tables.means import read_groups
+from lab.tables.outputs import medians, write_tables
+from lab.tables.ways import WAYS
 from making import ball
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.tables import outputs
-from pointsplat_ns.tables.cells import BINS, TABLE_FILES, CellJournal, distributions
-from pointsplat_ns.tables.layout import Layout, Table, latex_table, markdown_table
-from pointsplat_ns.tables.means import read_groups
-from pointsplat_ns.tables.outputs import medians, write_tables
-from pointsplat_ns.tables.ways import WAYS
 from table_cells import IDENTITY, about, cell, write_scene
 
 

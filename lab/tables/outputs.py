@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lab.tables.cells import BINS, TABLE_FILES
+from lab.tables.layout import Layout, Table, figure_medians, latex_document, markdown_table, markdown_text
+from lab.tables.means import Group, read_groups
+from lab.tables.ways import PROTOCOL, WAYS, Way, published
 from pointsplat_ns.io.files import replacing, write_json
-from pointsplat_ns.tables.cells import BINS, TABLE_FILES
-from pointsplat_ns.tables.layout import Layout, Table, figure_medians, latex_document, markdown_table, markdown_text
-from pointsplat_ns.tables.means import Group, read_groups
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, published
 from pointsplat_ns.tradeoff.machine import is_busy
 
 if TYPE_CHECKING:

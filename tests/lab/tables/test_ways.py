@@ -6,10 +6,10 @@ import sys
 import pytest
 
 import pointsplat_ns as ps
+from lab.tables.making import Reducer, SplatTransform
+from lab.tables.ways import PROTOCOL, WAYS, cell_key
 from making import box_room
 from pointsplat_ns.system.programs import ProgramFailed
-from pointsplat_ns.tables.making import Reducer, SplatTransform
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, cell_key
 
 CELLS = WAYS.cells(PROTOCOL.shares)
 

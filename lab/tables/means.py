@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
+from lab.tables.cells import TABLE_FILES, About, Cell, CellJournal
+from lab.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.tables.cells import TABLE_FILES, About, Cell, CellJournal
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS
 from pointsplat_ns.tradeoff.machine import is_busy
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
 

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lab.tables.scene import TableOptions, TableScene
+from lab.tables.ways import WAYS
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.pruning.scores import log_volume
-from pointsplat_ns.tables.scene import TableOptions, TableScene
-from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.journal import Form, check_types, restored_point
 from pointsplat_ns.tradeoff.points import Point
 
@@ -73,7 +73,7 @@ class Cell:
     """The measurement of one scene, made smaller in one way."""
 
     way: str
-    """Name of the way; see :mod:`~pointsplat_ns.tables.ways`."""
+    """Name of the way; see :mod:`~lab.tables.ways`."""
     point: Point
     """Figures. Its key is the key of the cell, and its command measures the cell again."""
     made_with: str

@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lab.tables.means import Group, Mean
+from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 from pointsplat_ns.io.files import three_digits
-from pointsplat_ns.tables.means import Group, Mean
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 from pointsplat_ns.tradeoff.points import ImageMetrics
 
 NO_FIGURE = "-"

@@ -5,11 +5,12 @@ import json
 import pytest
 
 import pointsplat_ns as ps
+from lab.tables.cells import TABLE_FILES
+from lab.tables.measure import measure_tables
+from lab.tables.ways import WAYS
 from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.tables.cells import TABLE_FILES
-from pointsplat_ns.tables.ways import WAYS
 from pointsplat_ns.tradeoff.judging import Judge
 
 
@@ -185,7 +186,7 @@ def test_two_scenes_of_one_name_and_no_scene_are_refused(measured, room, tmp_pat
     with pytest.raises(PointSplatError, match="both are called room"):
         measured(room, tmp_path / "other" / "room.ply")
     with pytest.raises(PointSplatError, match="no scene is named"):
-        ps.measure_tables([], tmp_path / "tables")
+        measure_tables([], tmp_path / "tables")
 
 
 def test_cells_of_another_scene_or_of_other_views_are_refused_unless_forced(measured, room):

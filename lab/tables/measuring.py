@@ -15,14 +15,14 @@ from pathlib import Path
 
 import torch
 
-from pointsplat_ns import __version__
+import pointsplat_ns
+from lab.tables.cells import About, Cell, CellJournal, distributions, identity
+from lab.tables.making import Maker, Tools
+from lab.tables.scene import OpenedScene, TableScene
+from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tables.cells import About, Cell, CellJournal, distributions, identity
-from pointsplat_ns.tables.making import Maker, Tools
-from pointsplat_ns.tables.scene import OpenedScene, TableScene
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.tradeoff.judging import Judge, Judged
 from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
 from pointsplat_ns.tradeoff.measuring import MadeScene, point_of
@@ -158,7 +158,7 @@ class _SceneWork:
             point=self._point(way, share, made, judged),
             made_with=self.tools.made_with(way, share, self.scene.name),
             seed=PROTOCOL.seed,
-            version=__version__,
+            version=pointsplat_ns.__version__,
             commit=source_commit(),
             opacities=opacities,
             volumes=volumes,
@@ -184,7 +184,7 @@ class _SceneWork:
         )
 
     def _point(self, way: Way, share: float, made: MadeScene, judged: Judged) -> Point:
-        command = ["pointsplat", "tables", str(self.scene.path), "-o", str(self.folder)]
+        command = ["python", "-m", "lab.tables", str(self.scene.path), "-o", str(self.folder)]
         command += ["--only", self.key(way, share), *self.tools.words(way, share, self.scene.name)]
         repairs = {"fine-tuned": way.fine_tuned, "refiner": way.network is not None}
         return point_of(
@@ -249,7 +249,7 @@ def source_commit() -> str:
 def _git(*words: str) -> str | None:
     """Output of a git command in the package's folder; None if it fails or is not there."""
     try:
-        command = ["git", "-C", str(Path(__file__).parents[1]), *words]
+        command = ["git", "-C", str(Path(pointsplat_ns.__file__).parent), *words]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20.0)
     except (OSError, subprocess.TimeoutExpired):
         return None

@@ -8,6 +8,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from lab.tables.cells import TABLE_FILES
+from lab.tables.making import Refiners, Tools
+from lab.tables.means import Group
+from lab.tables.measuring import Measuring
+from lab.tables.outputs import write_tables
+from lab.tables.scene import OpenedScene, TableOptions, TableScene
+from lab.tables.ways import PROTOCOL
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
@@ -18,13 +25,6 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, has_masks
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tables.cells import TABLE_FILES
-from pointsplat_ns.tables.making import Refiners, Tools
-from pointsplat_ns.tables.means import Group
-from pointsplat_ns.tables.measuring import Measuring
-from pointsplat_ns.tables.outputs import write_tables
-from pointsplat_ns.tables.scene import OpenedScene, TableOptions, TableScene
-from pointsplat_ns.tables.ways import PROTOCOL
 from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
@@ -87,10 +87,10 @@ def measure_tables(
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     [group] = ps.measure_tables(
+        ...     [group] = measure_tables(
         ...         [f"{folder}/room.ply"], f"{folder}/tables", only=["room/paper/10%"], views=2, side=64
         ...     )
-        >>> group.name, group.mean("paper", 0.1).gaussians
+        >>> group.name, group.mean("paper", 0.1, frozenset({"room"})).gaussians
         ('scenes', 30.0)
     """
     folder = Path(folder)

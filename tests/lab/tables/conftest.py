@@ -9,14 +9,15 @@ import torch
 
 import peers
 import pointsplat_ns as ps
+from lab.tables import outputs
+from lab.tables.measure import measure_tables
+from lab.tables.ways import Ways
 from making import box_room
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
-from pointsplat_ns.tables import outputs
-from pointsplat_ns.tables.ways import Ways
 from pointsplat_ns.tradeoff import machine
 
 
@@ -67,7 +68,7 @@ def measured(room, tmp_path) -> Callable[..., list]:
 
     def measure(*scenes: Path, folder: Path = tmp_path / "tables", **options):
         usual = {"keeps": (0.3,), "views": 2, "fine_tune": 2, "splat_transform": "/no/such/program"}
-        return ps.measure_tables(scenes or (room,), folder, **{**usual, **options})
+        return measure_tables(scenes or (room,), folder, **{**usual, **options})
 
     return measure
 

@@ -19,6 +19,8 @@ from typing import Any
 
 from torch import Tensor
 
+from lab.tables.scene import OpenedScene, TableOptions
+from lab.tables.ways import PROTOCOL, WAYS, Network, Way
 from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
@@ -29,8 +31,6 @@ from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.refiner import read_metadata
 from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tables.scene import OpenedScene, TableOptions
-from pointsplat_ns.tables.ways import PROTOCOL, WAYS, Network, Way
 from pointsplat_ns.tradeoff.measuring import MadeScene, make
 from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 

@@ -1,18 +1,24 @@
-"""``pointsplat tables``: the paper's tables on any scenes."""
+"""The paper's tables on any scenes.
+
+python -m lab.tables outputs/fox/splatfacto-cpu/RUN room.ply -o tables
+"""
 
 from __future__ import annotations
 
-import json
+import logging
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Data, Share, claim_folder
+from lab.common.printing import start
+from lab.tables.measure import measure_tables
+from pointsplat_ns.cli.scene_options import Share
+from pointsplat_ns.io.files import logger
+from pointsplat_ns.io.outputs import claimed_folder
 
 
-def tables(
+def main(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     keeps: tuple[Share, ...] = (0.5, 0.3, 0.1),
@@ -24,9 +30,8 @@ def tables(
     scoring_views: int = 40,
     fine_tune: int = 300,
     splat_transform: str | None = None,
-    data: Data = None,
+    data: Path | None = None,
     force: bool = False,
-    json_output: Json = False,
 ) -> None:
     """Measure the paper's Tables 1 to 4 and Figure 4 on any scenes, with our methods and splat-transform beside.
 
@@ -50,20 +55,20 @@ def tables(
         data: folder above the data of the runs, or that of one, where it is no longer where the runs say; a run whose
             data is not found is measured without photos, with a warning.
         force: start over with the given scenes.
-        json_output: print the content of tables.json, and nothing else on standard output.
     """
-    import pointsplat_ns as ps
-
-    claim_folder(output)
-    found = ps.measure_tables(
-        scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
-        scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, data=data, force=force,
-        progress=True,
-    )  # fmt: skip
-    if json_output:
-        print_json({"output": output, **json.loads((output / "tables.json").read_text("utf-8"))})
-        return
+    logging.basicConfig(format="%(message)s")
+    logger.setLevel(logging.INFO)
+    with claimed_folder(output):
+        found = measure_tables(
+            scenes, output, keeps=keeps, refiners=refiners, groups=groups, only=only, views=views, side=side,
+            scoring_views=scoring_views, fine_tune=fine_tune, splat_transform=splat_transform, data=data, force=force,
+            progress=True,
+        )  # fmt: skip
     for group in found:
         cells = sum(len(scene.cells) for scene in group.scenes)
         print(f"{group.name}: {cells} cells of {', '.join(scene.about.name for scene in group.scenes)}")
     print(f"{output}: tables.md, tables.tex, tables.json and figure4.png")
+
+
+if __name__ == "__main__":
+    start(main)
