@@ -17,6 +17,8 @@ from importlib import metadata
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from lab.common.printing import start
+
 KINDS = {
     "non-commercial": r"\bnc\b|non-?commercial",
     "GPL": r"(?<!l)gpl|(?<!lesser )general public licen[cs]e",
@@ -102,7 +104,12 @@ def _kind(text: str) -> str:
     return next((kind for kind, words in KINDS.items() if re.search(words, text, re.IGNORECASE)), "unnamed")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print the packages that this one requires whose licence asks for more than to be named, as rows of a table."""
     for found in licences():
         if found.kind != "permissive":
             print(f"| {found.package} | {found.extra or 'always'} | {found.kind} | {found.text} |")
+
+
+if __name__ == "__main__":
+    start(main)

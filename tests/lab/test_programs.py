@@ -17,7 +17,7 @@ from making import LAB, REPOSITORY
 from pointsplat_ns.errors import PointSplatError
 
 PROGRAMS = sorted(
-    ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
+    ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__main__")
     for path in LAB.rglob("*.py")
     if 'if __name__ == "__main__":' in path.read_text("utf-8")
 )
