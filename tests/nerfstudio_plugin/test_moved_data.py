@@ -12,7 +12,7 @@ import pointsplat_ns as ps
 from lab.tables.measure import measure_tables
 from making import run_of, without_data
 from pointsplat_ns.cli import main
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
@@ -116,3 +116,32 @@ def test_a_refiners_run_finds_the_scenes_that_moved(make_refined_run, trained_wa
     with pytest.raises(SceneError, match="gone"):
         ps.load(run)
     assert len(ps.load(run, data=tmp_path)) > 0
+
+
+def test_photos_of_other_poses_are_refused_by_data_and_by_photos(runs, moved, trained_walls, tmp_path):
+    """The same capture with its photos in another order: every file is there, and in the frame of the run."""
+    photos = sorted((moved / "wall" / "results").glob("frame*"))
+    contents = [photo.read_bytes() for photo in photos]
+    for photo, content in zip(photos, contents[4:] + contents[:4], strict=True):
+        photo.write_bytes(content)
+    text = "no more like the photos of their views than like others .* dB PSNR in 8 photos"
+    run = run_of(runs, "wall-b")
+    for call in (
+        lambda: ps.prune(run, "50%", data=moved),
+        lambda: ps.measure_tradeoff(run, tmp_path / "trade", repairs=("photos",), data=moved),
+    ):
+        with pytest.raises(DataError, match=text):
+            call()
+    shutil.move(moved, tmp_path / "gone_from_here")
+    config = run / "config.yml"
+    config.write_text(config.read_text().replace(*_parts(config.read_text(), tmp_path / "gone_from_here" / "wall")))
+    with pytest.raises(DataError, match=text):
+        ps.compact(run, "50%", effort="instant", photos=True)
+
+
+def _parts(text: str, place: Path) -> tuple[str, str]:
+    """The lines of a config that name a run's data, and those that name another place."""
+    lines = text.splitlines(keepends=True)
+    first = next(index for index, line in enumerate(lines) if "PosixPath" in line and line.startswith("data:")) + 1
+    last = next(index for index in range(first, len(lines)) if not lines[index].startswith("- "))
+    return "".join(lines[first:last]), "".join(f"- {part}\n" for part in place.parts)
