@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
@@ -22,9 +23,9 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import usable_part
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
-from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
@@ -117,8 +118,10 @@ def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
         return ply_bytes(len(scene), scene.sh_degree), scene
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene{suffix}"
-        save(scene, path)
-        return path.stat().st_size, scene if kind.read is None else read_scene(path).to(scene.device)
+        assert kind.write is not None
+        # Without the warning of losses, which is for the scene that is kept.
+        kind.write(usable_part(scene.detach().to("cpu", torch.float32)), path, silent)
+        return path.stat().st_size, scene if kind.read is None else kind.read(path).to(scene.device)
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
@@ -211,3 +212,33 @@ def test_offsets_of_any_extent_leave_small_positions(extent):
     offset = offset_for(means, np.full((11, 3), -30.0))
     assert np.abs(means - offset).max() <= 3 * extent + 1e-9
     assert offset_for(np.full((3, 3), np.nan), np.zeros((3, 3))) is None
+
+
+def test_two_scenes_are_filmed_in_the_frame_of_the_first(tmp_path):
+    scene = ball(400)
+    one = scene.replace(offset=UTM)
+    other = one.at_offset((UTM[0] + 3, UTM[1], UTM[2] - 1))
+    views = ps.sample_views(scene, 1, width=64, height=48)
+    ps.render_path(one, tmp_path / "same", other=one, path=views, labels=[], fps=1)
+    ps.render_path(one, tmp_path / "moved", other=other, path=views, labels=[], fps=1)
+    frames = [min((tmp_path / folder).iterdir()) for folder in ("same", "moved")]
+    pictures = [np.asarray(Image.open(path), np.float64) for path in frames]
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
+def test_a_pruned_scene_of_a_training_keeps_its_offset_and_up(tmp_path):
+    pytest.importorskip("nerfstudio", reason="the plugin imports it")
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import read_pruned, write_pruned
+
+    scene = cloud(20).replace(offset=UTM, up="-y", antialiased=True)
+    write_pruned(tmp_path / "a.safetensors", scene, 40, 1.0)
+    back, count, _ = read_pruned(tmp_path / "a.safetensors")
+    assert back.traits == scene.traits and count == 40 and same_bits(back, scene)
+
+
+def test_a_ply_that_is_pruned_in_parts_keeps_its_offset_and_takes_poses_of_its_frame(tmp_path):
+    with_doubles(ball(4000, log_size=math.log(0.1)), tmp_path / "a.ply")
+    main(["prune", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.ply"), "--keep", "50%", "--memory", "4GB"])
+    whole, small = ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply")
+    assert small.offset == whole.offset and len(small) == 2000
+    assert np.abs(np.median(absolute(small), axis=0) - np.median(absolute(whole), axis=0)).max() < 0.5

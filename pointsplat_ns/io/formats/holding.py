@@ -245,8 +245,10 @@ def _share(mask: Tensor, scene: Gaussians) -> float:
 
 def _weight(mask: Tensor, scene: Gaussians) -> float:
     """The share of Gaussians by their weight in pictures."""
+    if not bool(mask.any()):
+        return 0.0
     each = weights(scene)
-    return float(each[mask].sum() / each.sum()) if bool(mask.any()) else 0.0
+    return float(each[mask].sum() / each.sum())
 
 
 def _percent(share: float) -> str:
