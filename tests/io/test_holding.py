@@ -65,6 +65,17 @@ def test_spz_has_more_bits_after_the_point_where_gaussians_are_small(tmp_path, c
     assert fraction_bits(in_units(room(), 1e-6)) == 23
 
 
+def test_spz_that_is_written_again_loses_no_position():
+    for number in range(200):  # of some, rounded sizes would need one bit less
+        scene = in_units(cloud(40, number), 2.0 ** (-7 - number / 100))
+        bits = fraction_bits(scene)
+        read = scene.replace(
+            means=(scene.means * 2**bits).round() / 2**bits, scales=(16 * (scene.scales + 10)).round() / 16 - 10
+        )
+        again = fraction_bits(read)
+        assert torch.equal((read.means * 2**again).round() / 2**again, read.means)
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e-4, 1e-5])
 def test_spz_names_sizes_that_it_cuts_and_the_format_that_keeps_them(tmp_path, caplog, unit):
     small = in_units(room(), unit)

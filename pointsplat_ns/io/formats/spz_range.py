@@ -64,13 +64,21 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
 def fraction_bits(scene: Gaussians) -> int:
     """Bits after the point of the positions of a scene that is :func:`fitted`. Raises SceneError if a Gaussian is out
     of reach."""
-    bits = min(_fitting_bits(scene), max(_needed_bits(scene), FRACTION_BITS))
+    fitting, bits = _fitting_bits(scene), max(_needed_bits(scene), FRACTION_BITS)
+    if not _is_exact(scene, bits) and _is_exact(scene, bits + 1):  # of an SPZ file, whose sizes are rounded
+        bits += 1
+    bits = min(fitting, bits)
     if bits < 0:
         farthest = float(scene.means.abs().max())
         raise SceneError(
             f"a Gaussian lies {farthest:.3g} units from the origin; SPZ reaches to {FARTHEST}; scale the scene down"
         )
     return bits
+
+
+def _is_exact(scene: Gaussians, bits: int) -> bool:
+    levels = scene.means.double() * 2.0**bits
+    return torch.equal(levels, levels.round())
 
 
 def _fitting_bits(scene: Gaussians) -> int:
