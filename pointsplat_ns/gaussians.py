@@ -55,6 +55,24 @@ PLAIN = Traits()
 """The traits of a scene of which nothing is declared."""
 
 
+class _Activated(torch.autograd.Function):
+    """``exp`` or ``sigmoid`` of raw values; where the result or its slope is not finite, the gradient is 0, not NaN:
+    such a Gaussian is not drawn."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
+        value = function(raw)
+        ctx.save_for_backward(value)
+        ctx.function = function
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (value,) = ctx.saved_tensors
+        moved = grad * value if ctx.function is torch.exp else grad * (1 - value) * value
+        return torch.where(value.isfinite(), moved, 0.0), None
+
+
 @dataclass(frozen=True, repr=False)
 class Gaussians:
     """A scene of N Gaussians, on one device and of one floating dtype, in Splatfacto's own parametrisation.
@@ -62,7 +80,7 @@ class Gaussians:
     Attributes:
         means: (N, 3) positions, world, scene units.
         scales: (N, 3) natural logarithms of the standard deviations along the Gaussian's own axes, which are in scene
-            units; -Inf is a flat axis.
+            units; -Inf is a flat axis, and above 88.7 float32 cannot hold the deviation.
         quats: (N, 4) rotations of those axes into the world, quaternions wxyz of any length; zero is the identity.
         opacities: (N, 1) logits; +Inf is opacity 1 and -Inf opacity 0.
         features_dc: (N, 3) constant SH coefficient of red, green and blue: colour = 0.5 + :data:`SH_C0` * features_dc.
@@ -221,13 +239,14 @@ class Gaussians:
 
     @property
     def alphas(self) -> Tensor:
-        """Opacities in [0, 1], (N,)."""
-        return torch.sigmoid(self.opacities[:, 0])
+        """Opacities in [0, 1], (N,). The gradient of one that is NaN is 0."""
+        return _Activated.apply(self.opacities[:, 0], torch.sigmoid)
 
     @property
     def stds(self) -> Tensor:
-        """Standard deviations along the Gaussian's own axes, scene units, (N, 3)."""
-        return torch.exp(self.scales)
+        """Standard deviations along the Gaussian's own axes, scene units, (N, 3). The gradient of one that is NaN or
+        infinite is 0."""
+        return _Activated.apply(self.scales, torch.exp)
 
     @property
     def megabytes(self) -> float:
@@ -236,14 +255,15 @@ class Gaussians:
 
     def usable(self) -> Tensor:
         """Mask (N,) of drawable Gaussians: no value is NaN or infinite, except opacity logits (+-Inf are opacity 1 and
-        0) and log-scales of -Inf (a flat axis)."""
+        0) and log-scales of -Inf (a flat axis), and no standard deviation is infinite in the scene's dtype: log-scales
+        are at most 88.7 in float32 and bfloat16, 709 in float64 and 11 in float16."""
         ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
         for name, value in self.items():
             flat = value.reshape(len(self), -1) if len(self) else value.reshape(0, 1)
             if name == "opacities":
                 bad = flat.isnan()
             elif name == "scales":
-                bad = flat.isnan() | (flat == torch.inf)
+                bad = ~(flat.detach().exp() < torch.inf)  # of NaN, too
             elif bool(flat.sum().isfinite()):
                 continue  # a finite sum has only finite terms; thirty times faster than a test of each
             else:

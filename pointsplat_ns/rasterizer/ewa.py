@@ -63,6 +63,12 @@ def longest_axis(dtype: torch.dtype) -> float:
     return torch.finfo(dtype).max ** 0.25 / 4
 
 
+def longest_reach(dtype: torch.dtype, lens: Lens) -> float:
+    """Largest standard deviation divided by depth: longer axes are drawn with this one, and have no gradient. No more
+    than 1e-9 of an image would depend on them in float32."""
+    return longest_axis(dtype) / lens.steepness()
+
+
 def _ordered(low: float, high: float) -> tuple[float, float]:
     return (low, high) if low <= high else (high, low)  # the other way round where a focal length mirrors
 
@@ -159,7 +165,7 @@ class Project(torch.autograd.Function):
         unit, inverse_length = unit_rows(quats.index_select(0, ids).T.contiguous())
         std = scales.index_select(0, ids).T.contiguous()
         meaningful = (std >= 0).all(0)
-        std = torch.minimum(std, points[2] * (longest_axis(std.dtype) / lens.steepness()))
+        std = torch.minimum(std, points[2] * longest_reach(std.dtype, lens))
         shape = _shape(slopes, rz, unit, std, view, lens)
 
         p1, p2 = shape.p1, shape.p2
@@ -233,6 +239,7 @@ class Project(torch.autograd.Function):
         # P = reach (R^T a), with reach = f s / z
         grad_jx, grad_jy = grad_p1 * (lens.fx * rz), grad_p2 * (lens.fy * rz)
         grad_std = (shape.turned_a * grad_jx).addcmul_(shape.turned_b, grad_jy)
+        grad_std *= std * rz < longest_reach(std.dtype, lens) * (1 - 1e-6)  # the longest axes are as long for any scale
         grad_log_rz = (std * grad_std).sum(0)
         grad_turned_a, grad_turned_b = grad_jx.mul_(std), grad_jy.mul_(std)
         grad_unit = _rotation_backward(unit, shape.a, grad_turned_a, shape.b, grad_turned_b)

@@ -17,7 +17,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
 from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
-from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
+from pointsplat_ns.rasterizer.compiled.projection import camera_struct, count_meaningless, scene_struct
 from pointsplat_ns.rasterizer.constants import SLACK, TILE, Quality
 from pointsplat_ns.rasterizer.ewa import Lens
 from pointsplat_ns.rasterizer.projection import camera_of
@@ -35,7 +35,7 @@ Camera = tuple[Tensor, Tensor, Lens]
 
 def _placed(
     scene: Gaussians, camera: Camera, colored: bool, quality: Quality, most_pairs: int
-) -> tuple[KernelInputs, Tensor, Tensor] | None:
+) -> tuple[KernelInputs, Tensor, Tensor, int] | None:
     """What is drawn on which tile.
 
     Args:
@@ -46,8 +46,8 @@ def _placed(
         most_pairs: largest number of pairs of a Gaussian and a tile.
 
     Returns:
-        The table of Gaussians, the Gaussians of each tile front to back (P,), and where those of each tile start
-        (tiles + 1,), both int64; None if the pairs are too many.
+        The table of Gaussians, the Gaussians of each tile front to back (P,), where those of each tile start
+        (tiles + 1,), both int64, and the number of Gaussians that no camera can draw; None if the pairs are too many.
     """
     library, count = KERNELS.library, len(scene)
     with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
@@ -83,7 +83,7 @@ def _placed(
     pairs = torch.empty(total, **INDICES)
     task.fill(offsets=offsets, pairs=pairs)
     library.pointsplat_list(task, drawn, offsets[:-1].clone())
-    return inputs, pairs, offsets
+    return inputs, pairs, offsets, count_meaningless(*tensors)
 
 
 def _whole(lens: Lens) -> Region:
@@ -91,20 +91,20 @@ def _whole(lens: Lens) -> Region:
     return Region(0, -(-lens.height // TILE), 0, -(-lens.width // TILE))
 
 
-def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> tuple[Tensor, Tensor] | None:
-    """Colours (H, W, 3) over black and alpha (H, W, 1); None if the pairs of Gaussians and tiles
-    are more than ``most_pairs``."""
+def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> tuple[Tensor, Tensor, int] | None:
+    """Colours (H, W, 3) over black, alpha (H, W, 1) and the number of Gaussians that no camera can draw; None if the
+    pairs of Gaussians and tiles are more than ``most_pairs``."""
     found = _placed(scene, camera, True, quality, most_pairs)
     if found is None:
         return None
-    (inputs, pairs, offsets), lens = found, camera[2]
+    (inputs, pairs, offsets, skipped), lens = found, camera[2]
     whole, count = _whole(lens), offsets.numel() - 1
     image, final = torch.empty(count, 3, PIXELS, **FLOATS), torch.empty(count, PIXELS, **FLOATS)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
     on_threads(pairs.numel() >= SEVERAL, blending.KERNELS.library.pointsplat_blend, task)
     colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
-    return colors, 1.0 - through
+    return colors, 1.0 - through, skipped
 
 
 def weights(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> Tensor | None:
@@ -112,7 +112,7 @@ def weights(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int)
     found = _placed(scene, camera, False, quality, most_pairs)
     if found is None:
         return None
-    (inputs, pairs, offsets), lens = found, camera[2]
+    (inputs, pairs, offsets, _), lens = found, camera[2]
     task = blending.task_of((lens.width, lens.height), _whole(lens), pairs, offsets, inputs, offsets)
     return blending.weigh(task, pairs, len(scene))
 
@@ -154,7 +154,7 @@ def _as_torch() -> bool:
         (pixels,) = torch.autograd.grad(by_torch(flat, None)[0].sum(), flat)
     if drawn is None or weighed is None:
         return False
-    return agreement([*drawn, weighed], [image, alpha, pixels[:, 0]], off=1e-4, share=1e-2)
+    return agreement([*drawn[:2], weighed], [image, alpha, pixels[:, 0]], off=1e-4, share=1e-2)
 
 
 KERNELS = Kernels("the rasterizer", Path(__file__).with_name("compiled") / "pictures.cpp", _as_torch)

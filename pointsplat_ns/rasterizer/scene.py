@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Literal
 
 import torch
@@ -44,6 +45,9 @@ def render(
     Raises:
         ValueError: if a camera is not finite or has no focal length, or there is no such quality.
 
+    Warns:
+        UserWarning: if some Gaussians are not :meth:`~pointsplat_ns.Gaussians.usable`; their gradients are 0.
+
     Example:
         >>> import pointsplat_ns as ps
         >>> room = ps.example_room()
@@ -70,7 +74,9 @@ def render_with_alpha(
         if backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
             drawn = pictures.picture(scene, _camera(scene, view), QUALITIES[quality], MOST_PAIRS)
             if drawn is not None:
-                return _over(*drawn, view), drawn[1]
+                image, alpha, skipped = drawn
+                _warn_of(skipped, scene)
+                return _over(image, alpha, view), alpha
         colors = scene.features_dc, scene.features_rest
         image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
         return _over(image, alpha, view), alpha
@@ -91,7 +97,7 @@ def _camera(scene: Gaussians, view: View) -> pictures.Camera:
 def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
     """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
     :func:`~pointsplat_ns.rasterization` takes."""
-    image, alpha, _ = rasterization(
+    image, alpha, meta = rasterization(
         means=scene.means,
         quats=scene.quats,
         scales=scene.stds,
@@ -107,7 +113,15 @@ def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tupl
         eps2d=view.eps2d,
         **options,
     )
+    _warn_of(meta.get("skipped", 0), scene)  # gsplat does not count
     return image[0], alpha[0]
+
+
+def _warn_of(skipped: int, scene: Gaussians) -> None:
+    """Warn of Gaussians that are not drawn because of their values, once for each number of them."""
+    if skipped:
+        text = f"{skipped} of {len(scene)} Gaussians have NaN or infinite values and are not drawn"
+        warnings.warn(text, stacklevel=1)  # of one line, so that one text is shown once
 
 
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:

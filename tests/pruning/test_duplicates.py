@@ -10,7 +10,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import band_energies, cut_sh, duplicates, energy_lost
 from pointsplat_ns.pruning.duplicates import Copies, stacked
-from pointsplat_ns.pruning.merging import merge
+from pointsplat_ns.pruning.merging import merge, rounds
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
@@ -145,3 +145,15 @@ def test_a_degree_that_is_none_is_said(degree):
     for function in (cut_sh, energy_lost):
         with pytest.raises(BudgetError, match=f"SH degree is {degree}; expected 0 to 3"):
             function(normal_scene(20), degree)
+
+
+def test_where_only_copies_go_nothing_is_drawn_or_compared(monkeypatch):
+    """A million copies cost renders in which each covers the picture, though no pair is chosen."""
+    scene = normal_scene(1, degree=1)[[0] * 5000]
+    for name in ("views_and_weights", "other_neighbours", "pair_costs"):
+        monkeypatch.setattr(rounds, name, lambda *given: pytest.fail("no pair is to be chosen"))
+    merged = rounds.merge(scene, 1500)
+    assert len(merged.scene) == 1500 and merged.views is None
+    assert len(merged.assignment.unique()) == 1500 and int(merged.assignment.min()) == 0
+    with pytest.raises(pytest.fail.Exception):
+        rounds.merge(scene.replace(means=scene.means + torch.arange(5000)[:, None]), 1500)

@@ -5,13 +5,15 @@ Input is rounded to float32 first, so that what is compared is the arithmetic, n
 
 import dataclasses
 import functools
+import itertools
 import math
+import warnings
 
 import pytest
 import torch
 
 from making import camera_askew, splats_in_view
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference, render, render_depth
 from pointsplat_ns.views import View
 
@@ -21,7 +23,7 @@ NAMES = ("means", "quats", "scales", "opacities", "colors")
 make_scene = functools.partial(splats_in_view, seed=11, scale=-2.5)
 
 
-def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, slow=False):
+def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, slow=False, compiled=None):
     """Image with depth, alpha, and the gradients of a fixed random sum of them, in float64."""
     leaves = [t.detach().to(dtype, copy=True).requires_grad_() for t in scene]
     w, h = size
@@ -33,7 +35,7 @@ def draw(scene, view, K, size, dtype, near=0.01, mode="classic", sh_degree=3, sl
     else:
         image, alpha, meta = rasterization(
             *leaves, view[None].to(dtype), K[None].to(dtype), w, h, near_plane=near,
-            sh_degree=sh_degree, rasterize_mode=mode, render_mode="RGB+D",
+            sh_degree=sh_degree, rasterize_mode=mode, render_mode="RGB+D", compiled=compiled,
         )  # fmt: skip
         image, alpha = image[0], alpha[0]
     g = torch.Generator().manual_seed(1)
@@ -137,6 +139,69 @@ def test_degenerate_gaussians(case, mode):
         scene[3][:] = 40.0  # the compensation is at or near its lower bound of 0.005
     check(scene, camera_askew(), mode=mode, reference=case != "log-scales from -80 to 20")
     # (with axes of 1e20 pixels the reference's xx yy - xy^2 cancels to 0 even in float64)
+
+
+@pytest.mark.parametrize("compiled", [None, False])
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_gradients_are_right_for_any_size_that_float32_holds(axes, mode, compiled):
+    view, K = (t.float().double() for t in camera_askew())
+    for log_scale, opacity in itertools.product((0.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 88.7), (0.02, 0.3, 0.99)):
+        scene = make_scene(5)
+        scene[2][:, :axes], scene[3][:] = math.exp(log_scale), opacity
+        scene = [t.float().double() for t in scene]
+        single, single_grads = draw(scene, view, K, (37, 29), torch.float32, mode=mode, compiled=compiled)
+        double, double_grads = draw(scene, view, K, (37, 29), F64, mode=mode)
+        assert (single - double).abs().max() <= 1e-5, log_scale  # as in check()
+        pairs = [relative_change(scene, grads) for grads in (single_grads, double_grads)]
+        # What is flat over the image does not change with its size: that gradient is 1e-9 of the largest and less.
+        largest = max(float(want.norm()) for want in pairs[1])
+        for name, got, want in zip(NAMES, *pairs, strict=True):
+            assert (got - want).norm() <= 5e-6 * largest, (name, log_scale, opacity)
+
+
+def _with(name, value):
+    def change(scene):
+        values = getattr(scene, name).clone()
+        values.flatten(1)[1, 0] = value
+        return scene.replace(**{name: values})
+
+    return change
+
+
+UNUSABLE = {
+    **{f"NaN in {name}": _with(name, math.nan) for name in PARAMETERS},
+    **{f"infinity in {name}": _with(name, math.inf) for name in PARAMETERS if name != "opacities"},
+    "a log-scale of 89": _with("scales", 89.0),
+}
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_unusable_gaussians_are_counted_and_have_no_gradient(case, compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr("pointsplat_ns.system.kernels.Kernels.usable", lambda self, wanted: False)
+    means, quats, scales, opacities, sh = (value.float() for value in make_scene(9))
+    scene = Gaussians(means, scales.log(), quats, torch.logit(opacities)[:, None], sh[:, 0], sh[:, 1:])
+    spoilt = UNUSABLE[case](scene)
+    assert spoilt.usable().tolist() == [row != 1 for row in range(9)]
+    assert _with("scales", 88.7)(scene).usable().all() and _with("opacities", math.inf)(scene).usable().all()
+
+    rest = [0, *range(2, 9)]
+    view = View(*camera_askew(), 37, 29, torch.zeros(3))
+    leaves = spoilt.map(lambda value: value.clone().requires_grad_())
+    others = scene[rest].map(lambda value: value.clone().requires_grad_())
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        image, wanted = render(leaves, view), render(others, view)
+        without_gradients = render(spoilt, view)
+    grads = torch.autograd.grad(image.square().sum(), leaves.tensors())
+    wanted_grads = torch.autograd.grad(wanted.square().sum(), others.tensors())
+    assert torch.equal(image, wanted) and torch.allclose(without_gradients, wanted.detach(), atol=1e-5)
+    for (name, _), grad, expected in zip(scene.items(), grads, wanted_grads, strict=True):
+        assert not grad[1].any() and torch.equal(grad[rest], expected), name
+    texts = {str(warning.message) for warning in said}
+    assert texts == {"1 of 9 Gaussians have NaN or infinite values and are not drawn"}
 
 
 def centre_of(view):

@@ -36,7 +36,7 @@ from pointsplat_ns.pruning.merging.state import State, initial_state
 from pointsplat_ns.pruning.merging.tree import Tree
 from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
-from pointsplat_ns.system.tensors import INDICES
+from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
 
@@ -186,7 +186,7 @@ def _levels(
         left = max(k, copies.distinct)
         if step is None or left < len(step.participants):
             with one_thread_each():
-                step = first_step(copies.reduced(left), views, settings)
+                step = first_step(copies.reduced(left), views, settings, pairs=left > last)
         if k == last:
             del copies
         give_back_freed_memory()
@@ -237,10 +237,13 @@ def views_and_weights(
     return viewpoints, visibility_weights(participants, viewpoints, settings)
 
 
-def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeSettings) -> Step:
-    """The step before the first round; ``views`` as for :func:`merge`."""
+def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeSettings, pairs: bool = True) -> Step:
+    """The step before the first round; ``views`` as for :func:`merge`. Without ``pairs`` no round follows, so nothing
+    is rendered: a million copies, each of which covers the picture, would take as long as all else."""
     participants = Participants.of(reduced.scene, reduced.members)
-    viewpoints, weights = views_and_weights(participants, views, settings)
+    viewpoints, weights = None, torch.ones(len(participants), **FLOATS)
+    if pairs:
+        viewpoints, weights = views_and_weights(participants, views, settings)
 
     def dense() -> Gaussians:
         whole = len(participants) == len(participants.scene)

@@ -49,6 +49,7 @@ struct Position {
 // The projected covariance and its intermediate values.
 struct Shape {
     Lane tx, ty, unit[4], inverse_length, std[3], rotation[3][3];
+    Mask longest[3];  // axes that are drawn shorter than they are
     Lane a[3], b[3], turned_a[3], turned_b[3], p1[3], p2[3], normal[3];
     Lane xx, xy, yy, det0, blur, det, ratio;  // xx and yy without eps2d
 
@@ -57,7 +58,10 @@ struct Shape {
         lanes.load(scene.quats, unit);
         lanes.load(scene.scales, std);
         inverse_length = normalise(unit);
-        for (Lane& value : std) value = smaller(value, at.z * camera.longest);
+        for (int i = 0; i < 3; ++i) {
+            longest[i] = std[i] >= at.z * camera.longest;
+            std[i] = smaller(std[i], at.z * camera.longest);
+        }
         rotate();
         const auto& view = camera.near_view;
         for (int i = 0; i < 3; ++i) a[i] = view[0][i] - tx * view[2][i], b[i] = view[1][i] - ty * view[2][i];

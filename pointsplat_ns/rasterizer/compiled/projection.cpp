@@ -125,7 +125,7 @@ void differentiate_lanes(const ProjectionGradient& task, const Lanes& lanes, con
     Lane grad_std[3], grad_turned_a[3], grad_turned_b[3], grad_unit[4], grad_a[3], grad_b[3];
     for (int i = 0; i < 3; ++i) {
         const Lane along_x = grad_p1[i] * (camera.fx * at.rz), along_y = grad_p2[i] * (camera.fy * at.rz);
-        grad_std[i] = s.turned_a[i] * along_x + s.turned_b[i] * along_y;
+        grad_std[i] = s.longest[i] ? ZERO : s.turned_a[i] * along_x + s.turned_b[i] * along_y;
         grad_turned_a[i] = along_x * s.std[i], grad_turned_b[i] = along_y * s.std[i];
     }
     rotation_backward(s, grad_turned_a, grad_turned_b, grad_unit);
