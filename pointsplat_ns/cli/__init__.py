@@ -14,10 +14,8 @@ import signal
 import sys
 import threading
 import types
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
@@ -98,23 +96,14 @@ class _PrintHandler(logging.Handler):
 
 @contextmanager
 def _log_printed(level_printed: int) -> Iterator[None]:
-    """Print the package's log, from a level on, and its warnings, while the context is open."""
+    """Print the package's log, from a level on, while the context is open."""
     logger = logging.getLogger("pointsplat_ns")
-    handlers, propagate, level, show = logger.handlers, logger.propagate, logger.level, warnings.showwarning
+    handlers, propagate, level = logger.handlers, logger.propagate, logger.level
     logger.handlers, logger.propagate = [_PrintHandler()], False
     logger.setLevel(level_printed)
-
-    def show_ours(message: Warning | str, category: type[Warning], filename: str, *rest: Any) -> None:
-        if Path(filename).is_relative_to(Path(__file__).parents[1]):
-            logger.warning("%s", message)  # a line, without our source
-        else:
-            show(message, category, filename, *rest)
-
-    warnings.showwarning = show_ours
     try:
         yield
     finally:
-        warnings.showwarning = show
         logger.handlers, logger.propagate = handlers, propagate
         logger.setLevel(level)
 

@@ -96,13 +96,3 @@ def test_what_was_chosen_for_the_scene_and_distributions_are_printed_if_asked_fo
     main(["prune", str(ply), "--keep", "50%", "--dry-run", "--verbose"])
     said = capsys.readouterr().out
     assert "sizes of merged Gaussians x " in said and "opacity" in said and "quantiles" in said
-
-
-def test_gaussians_that_are_not_drawn_are_named_in_a_line_of_their_own(ply, capsys):
-    scene = ps.load(ply)
-    scene.scales[3] = 89.0
-    ps.save(scene, "broken.ply")
-    main(["render", "broken.ply", "--frames", "2", "--resolution", "32x24", "-o", "frames"])
-    lines = capsys.readouterr().err.splitlines()
-    assert f"1 of {COUNT} Gaussians have NaN or infinite values and are not drawn" in lines
-    assert not any("Warning" in line for line in lines)

@@ -125,7 +125,7 @@ def test_cutting_leaves_the_rest_bit_for_bit(degree):
     assert all(torch.equal(a, b) for (name, a), (_, b) in zip(cut.items(), scene.items(), strict=True) if name != "features_rest")  # fmt: skip # noqa: E501
 
 
-@pytest.mark.parametrize("case", ["empty", "no colour", "invisible", "nan", "huge scales", "degree 0"])
+@pytest.mark.parametrize("case", ["empty", "no colour", "invisible", "nan", "huge scales", "larger scales", "degree 0"])
 def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
     scene = normal_scene(20)
     scene = {
@@ -133,7 +133,8 @@ def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
         "no colour": lambda: scene.replace(features_rest=torch.zeros_like(scene.features_rest)),
         "invisible": lambda: scene.replace(opacities=torch.full_like(scene.opacities, -math.inf)),
         "nan": lambda: scene.map(lambda value: value * math.nan),
-        "huge scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 1e4)),
+        "huge scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 88.0)),
+        "larger scales": lambda: scene.replace(scales=torch.full_like(scene.scales, 1e4)),  # are not drawn
         "degree 0": lambda: normal_scene(20, 0),
     }[case]()
     lost = energy_lost(scene, 0)
