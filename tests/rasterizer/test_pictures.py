@@ -140,7 +140,7 @@ def test_long_lists_of_a_tile_are_in_the_order_of_depth_and_equal_depths_in_that
     scene = scene.replace(means=means, scales=torch.full((count, 3), -3.0), opacities=torch.full((count, 1), -4.0))
     camera = drawing._camera(scene, view_of())
     found = pictures._placed(scene, camera, True, drawing.QUALITIES["exact"], 10**6)
-    _, pairs, offsets = found
+    _, pairs, offsets, _ = found
     wanted = means[:, 2].sort(stable=True).indices
     lengths = offsets.diff()
     longest = int(lengths.argmax())
