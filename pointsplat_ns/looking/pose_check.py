@@ -21,6 +21,7 @@ from pointsplat_ns.looking.content import content_size, thinned
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
 from pointsplat_ns.rasterizer import pixels_of, render
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import View, Views
 
 
@@ -154,7 +155,7 @@ def likeness(scene: Gaussians, photos: Sequence[Photo], settings: PoseCheckSetti
         size = max(1, view.height // k), max(1, view.width // k)
         stretch = view.K.new_tensor([[size[1] / view.width], [size[0] / view.height], [1.0]])
         small = replace(view, K=view.K * stretch, width=size[1], height=size[0])
-        counted = torch.ones(1, *photo.shape[:2]) if mask is None else mask.permute(2, 0, 1).cpu()
+        counted = torch.ones(1, *photo.shape[:2], **FLOATS) if mask is None else mask.permute(2, 0, 1).cpu()
         weight = F.adaptive_avg_pool2d(counted.double(), size).ge(0.5).double()
         picture = F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1).double().cpu(), size) * weight
         rendered = render(drawn, small).permute(2, 0, 1).double().cpu() * weight
