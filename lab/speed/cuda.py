@@ -157,6 +157,8 @@ class Trainings:
 
     def _trained(self, config: Any, name: str, steps: int, load: Path | None = None) -> tuple[Any, list[float]]:
         """The trainer after some steps, and their losses. Runs that are whole are in ``runs``, and others not."""
+        from nerfstudio.utils import writer
+
         config.output_dir = self.folder / ("halves" if load is None else "runs")
         config.experiment_name, config.max_num_iterations, config.load_dir = name, steps, load
         config.machine.device_type, config.vis = self.device.type, "tensorboard"
@@ -175,7 +177,13 @@ class Trainings:
             return result
 
         trainer.train_iteration = recorded
-        trainer.train()
+        try:
+            trainer.train()
+        finally:  # nerfstudio keeps them for the process, but the folder is removed
+            for each in writer.EVENT_WRITERS:
+                if isinstance(each, writer.TensorboardWriter):
+                    each.tb_writer.close()
+            writer.EVENT_WRITERS.clear()
         return trainer, losses
 
 
