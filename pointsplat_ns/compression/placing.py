@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians, Offset
 from pointsplat_ns.geometry.transforms import axis_along, smallest_turn
-from pointsplat_ns.io.offsets import from_centre
+from pointsplat_ns.io.offsets import from_centre, warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
@@ -76,7 +76,11 @@ def place(
         scene = Similarity(torch.eye(3, **DOUBLES), scale, torch.zeros(3, **DOUBLES)).apply(scene)
     if offset == "centre":
         return from_centre(scene)
-    return scene if point is None else scene.at_offset(point)
+    if point is None:
+        return scene
+    moved = scene.at_offset(point)
+    warn_if_far(moved, "the scene about this offset")
+    return moved
 
 
 def _frame_at(path: str | Path) -> Similarity:

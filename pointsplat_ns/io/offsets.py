@@ -75,13 +75,13 @@ def with_shift(traits: Traits, shift: Offset | None, path: Path) -> Traits:
     return traits._replace(offset=(x, y, z))
 
 
-def warn_if_far(scene: Gaussians, path: Path) -> None:
+def warn_if_far(scene: Gaussians, path: Path | str) -> None:
     """Log that a scene's positions have lost digits, if steps of float32 are large beside the sizes of Gaussians."""
     some = scene[:: max(1, len(scene) // SAMPLED)]
     if not len(some):
         return
-    means = some.means.double().numpy()
-    times = _steps_a_size(means, some.scales.double().numpy())
+    means = some.means.detach().double().cpu().numpy()
+    times = _steps_a_size(means, some.scales.detach().double().cpu().numpy())
     if times > _COARSE:
         logger.warning(
             "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the median size of a Gaussian: "

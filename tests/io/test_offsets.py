@@ -195,6 +195,10 @@ def test_convert_recentres_and_sets_the_offset(tmp_path, capsys):
     assert back.offset == (1000.5, 1000.5, 1000.5) and float(back.means.abs().max()) < 1
     assert "positions are relative to 1000.5 1000.5 1000.5" in capsys.readouterr().out
     main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--offset", "0", "0", "0"])
+    assert "have lost their digits" not in capsys.readouterr().err
+    ps.save(scene.replace(offset=UTM), tmp_path / "utm.ply")
+    main(["convert", str(tmp_path / "utm.ply"), str(tmp_path / "far.ply"), "--offset", "0", "0", "0"])
+    assert "positions have lost their digits" in capsys.readouterr().err
     back = ps.load(tmp_path / "c.ply")
     assert back.offset is None and torch.allclose(back.means, scene.means + 1000, atol=1e-4)
     main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "d.ply"), "--offset", "990", "1000", "-7.5"])
