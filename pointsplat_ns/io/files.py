@@ -66,6 +66,8 @@ def open_inside(folder: Path, path: Path) -> BinaryIO:
     real = Path(os.path.realpath(path))
     if root not in real.parents:
         raise OSError(errno.EPERM, f"leads out of {folder}", str(path))
+    if os.open not in os.supports_dir_fd:  # Windows
+        return open(real, "rb")
     nothing_else = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     at = os.open(root, os.O_RDONLY)
     try:
