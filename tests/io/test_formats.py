@@ -163,7 +163,7 @@ def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):
     names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
     head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    rows = np.arange(2 * len(names), dtype="<f4").reshape(2, -1)
+    rows = np.arange(2 * len(names), dtype="<f4").reshape(2, -1) / 64  # log-scales that can be drawn
     (tmp_path / "a.ply").write_bytes(head.encode() + rows.tobytes())
     scene = ps.load(tmp_path / "a.ply")
     assert scene.sh_degree == 3 and "SH degree 4, read up to degree 3" in caplog.text
