@@ -36,6 +36,12 @@ class UndistortedDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
         super().__init__(dataparser_outputs, scale_factor)
+        if scale_factor != 1.0:
+            # nerfstudio multiplies sizes of photos in float64, those of cameras in float32: 360 x 0.35 is 125 or 126
+            given = dataparser_outputs.cameras
+            self.cameras.width, self.cameras.height = (
+                (size.double() * scale_factor).long() for size in (given.width, given.height)
+            )
         _need_poses(self)
         _need_finite(self)
         _need_one_time(self)

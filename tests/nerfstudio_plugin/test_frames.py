@@ -31,22 +31,24 @@ def make_dataset(
     camera_type: CameraType = CameraType.PERSPECTIVE,
     masks: bool = False,
     scale: float = 1.0,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
 ) -> UndistortedDataset:
+    width, height = size
     rng = np.random.default_rng(7)
     photos, mask_paths = [], []
     for i in range(num):
         small = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
         photos.append(folder / f"photo{i}.png")
-        cv2.imwrite(str(photos[-1]), cv2.resize(small, (WIDTH, HEIGHT)))
+        cv2.imwrite(str(photos[-1]), cv2.resize(small, (width, height)))
         mask_paths.append(folder / f"mask{i}.png")
-        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask = np.full((height, width), 255, np.uint8)
         mask[:, : 5 + i] = 0
         cv2.imwrite(str(mask_paths[-1]), mask)
     poses = torch.eye(4)[None, :3].repeat(num, 1, 1)
     poses[:, 0, 3] = torch.arange(num)
     lens = None if distortion is None else torch.tensor(distortion)
     metadata = {"fisheye_crop_radius": 14.0} if camera_type == CameraType.FISHEYE624 else None
-    cameras = Cameras(poses, 35.0, 36.0, 20.5, 14.0, WIDTH, HEIGHT, lens, camera_type, metadata=metadata)
+    cameras = Cameras(poses, 35.0, 36.0, 20.5, 14.0, width, height, lens, camera_type, metadata=metadata)
     outputs = DataparserOutputs(
         image_filenames=photos,
         cameras=cameras,
@@ -92,6 +94,15 @@ def test_image_mask_and_intrinsics_are_those_nerfstudio_caches(tmp_path, distort
         assert (int(camera.width), int(camera.height)) == (int(theirs.width), int(theirs.height))
         assert data["image"].shape[:2] == (int(camera.height), int(camera.width))
         assert torch.equal(camera.camera_to_worlds, theirs.camera_to_worlds)
+
+
+@pytest.mark.parametrize("scale", [0.35, 0.7, 0.9, 1 / 3, 0.29, 0.58])
+def test_reduced_photos_are_of_the_size_of_their_cameras(tmp_path, scale):
+    """Some products of a size and a scale are a whole number in float32, and just below it in float64."""
+    for width, height in ((540, 360), (360, 640), (100, 50)):
+        dataset = make_dataset(tmp_path, num=1, scale=scale, size=(width, height))
+        camera, image = dataset.cameras[0], dataset.get_data(0, "uint8")["image"]
+        assert (int(camera.width), int(camera.height)) == (image.shape[1], image.shape[0])
 
 
 def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_path):
