@@ -7,9 +7,10 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import box_room, fast_config, same
+from making import box_room, dense_config, fast_config, same
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
+from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.system.threads import fixed_threads
@@ -134,7 +135,7 @@ def test_a_refiner_and_levels_of_detail_are_computed_on_a_gpu_from_one_thread(ro
     check(gpu)
 
 
-@pytest.mark.parametrize("method", ["splatfacto-cpu", "pointsplat"])
+@pytest.mark.parametrize("method", ["splatfacto-cpu", "pointsplat", "pointsplat without photos"])
 def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
     method, trained_walls, wall_scene, wall_config, run_training, tmp_path
 ):
@@ -142,6 +143,9 @@ def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
         folder = tmp_path / device.type
         if method == "pointsplat":
             config = fast_config(trained_walls, folder, steps=3)
+        elif method == "pointsplat without photos":  # scenes are sampled and pruned in the background
+            config = dense_config(rooms, folder, steps=4)
+            config.pipeline.model.by, config.steps_per_eval_image = "merge", 0
         else:
             config = wall_config(wall_scene, folder, 12)  # densification is in them
         config.machine.device_type = device.type
@@ -149,6 +153,9 @@ def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
             group["optimizer"].fused = False  # torch has no such kernels for the pretended device
         return run_training(config)[1]
 
+    rooms = tmp_path / "rooms"
+    for seed in range(2):
+        write_ply(box_room(seed, count=400, size=0.1), rooms / f"room{seed}.ply")
     wanted = losses_on(torch.device("cpu"))
     with pretend_gpu() as gpu:
         found = losses_on(GPU)
