@@ -18,7 +18,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -266,9 +265,12 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
     threads = (threads or torch.get_num_threads()) if worth_it else 1
     others: list[Future[object]] = []
     try:
-        with suppress(RuntimeError):  # a program that is ending starts no more threads: this one does it all
+        try:
             for _ in range(threads - 1):
                 others.append(_pool(os.getpid()).submit(call))
+        except RuntimeError:  # the program is ending and starts no more threads
+            if threading.current_thread() is not threading.main_thread():
+                raise SystemExit from None  # ends one of a viewer, for which nobody waits
         call()
     finally:
         wait(others)  # they use the memory of the arguments, also where Ctrl-C ended the call here

@@ -43,11 +43,14 @@ def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():
     assert len(ended) == 2
 
 
-def test_a_program_that_is_ending_calls_kernels_in_its_own_thread(monkeypatch):
+def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeypatch):
     pool, called = ThreadPoolExecutor(1), []
     pool.shutdown()
     monkeypatch.setattr(kernels, "_pool", lambda process: pool)
     kernels.on_threads(True, lambda _: called.append(threading.get_ident()), threads=3)
+    assert called == [threading.get_ident()]
+    with ThreadPoolExecutor(1) as other, pytest.raises(SystemExit):
+        other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
     assert called == [threading.get_ident()]
 
 
