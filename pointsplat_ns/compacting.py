@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, read_posed
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
@@ -33,7 +33,8 @@ Source = Gaussians | str | Path
 """A dense scene, or its path."""
 
 ViewsInput = Views | str | Path | None
-"""Views, the run whose dataset has the poses, a file of cameras, or None for those of the scene's run."""
+"""Views, the run whose dataset has the poses, a file of cameras, None for those of the scene's run or of a file of
+cameras that lies beside the scene, or "none" for sampled ones."""
 
 ResolutionInput = tuple[int, int] | str | None
 """Width and height of pictures, pixels."""
@@ -109,7 +110,6 @@ def compact_source(
     with progress_bar(progress) as report:
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
-            from pointsplat_ns.compression.posed_scene import check_photos
 
             photos = None if request.photos is None else _training_photos(run_of(scene, None), data)
             if photos is not None:
@@ -163,6 +163,8 @@ def read_source(
         from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
 
         need_named_data(scene if views is None else views, data)
+    sampled = str(views) == NO_POSES
+    views = None if sampled else views
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file
 
@@ -172,13 +174,16 @@ def read_source(
                 "cameras"
             )
         if is_camera_file(views):
-            from pointsplat_ns.compression.posed_scene import read_posed
-
             dense, views = read_posed(scene, views)
             return dense, ViewSource(dense, given=views, resolution=size, up=upward)
-    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
+    if isinstance(scene, Gaussians):
+        dense, found = scene, None
+    else:
+        dense, found, _ = read_found(Path(scene), None if views is None and not sampled else NO_POSES)
     if isinstance(views, Views):
-        return dense, ViewSource(dense, given=views, resolution=size, up=upward)
+        found = views
+    if found is not None:
+        return dense, ViewSource(dense, given=found, resolution=size, up=upward)
     run = run_of(scene, views)
     read = functools.partial(_dataset_views, data=data)
     return dense, ViewSource(dense, run=run, dataset_views=read, resolution=size, up=upward)

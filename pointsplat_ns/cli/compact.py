@@ -103,7 +103,8 @@ def compact(
             within the limits.
         target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP project; for one scene. By default the views of its dataset, or sampled ones.
+            COLMAP project; for one scene. By default the views of its dataset, or of such a file beside the scene, or
+            sampled ones; none always samples them.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

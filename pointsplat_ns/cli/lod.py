@@ -67,7 +67,8 @@ def lod(
         chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the root of a COLMAP project;
-            by default the views of its dataset, or sampled ones.
+            by default the views of its dataset, or of such a file beside the scene, or sampled ones; none always
+            samples them.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

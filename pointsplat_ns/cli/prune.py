@@ -80,7 +80,8 @@ def prune(
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
         fine_tune: number of steps of optimising the result against renders of the dense scene.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP project. They must be of this scene. By default the views of its dataset, or sampled ones.
+            COLMAP project. They must be of this scene. By default the views of its dataset, or of such a file beside
+            the scene, or sampled ones; none always samples them.
         resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
             default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

@@ -60,7 +60,8 @@ def tradeoff(
         repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
-            no photos are used then. By default the views of its dataset, or sampled ones.
+            no photos are used then. By default the views of its dataset, or of such a file beside the scene, or sampled
+            ones; none always samples them.
         resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
             timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
         up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pointsplat_ns.errors import DataError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.camera_files import NamedViews, read_named_views, transforms_beside
+from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_named_views, transforms_beside
+from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.pictures import read_reduced
-from pointsplat_ns.io.runs import RUN_FILES
+from pointsplat_ns.io.runs import RUN_FILES, may_be_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.pose_check import POSE_CHECK, Photo, likeness, pose_faults
 from pointsplat_ns.views import Views, spread_indices
@@ -24,6 +25,41 @@ def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussi
     found = found.relative_to(dense.offset)
     found.check(dense)
     return dense, found.views
+
+
+NO_POSES = "none"
+"""In place of a file of cameras: views are sampled, whatever lies beside the scene."""
+
+
+def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
+    """Views from a file of cameras that lies beside a scene's file or above it, see
+    :func:`~pointsplat_ns.io.camera_files.camera_files_near`; None if there is none that belongs to the scene.
+
+    The file is named in one line. It counts if the views show the scene sharp, and either photos that lie there are
+    like renders, or a training wrote its poses in the scene's frame, or ``dataparser_transforms.json`` moves them.
+    """
+    for place in camera_files_near(path):
+        try:
+            found = PosesFile.of(path, place).relative_to(scene.offset)
+            if found.check(scene) or found.named.in_scene_frame or found.transforms is not None:
+                logger.info("poses: %s; --poses none samples views instead", place)
+                return found
+            why = "no photos beside it tell whether it belongs to the scene"
+        except (DataError, SceneError) as error:
+            why = str(error)
+        logger.info("%s: not used for views: %s", place, why)
+    return None
+
+
+def read_found(path: Path, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
+    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. Errors are
+    those of :func:`read_posed`."""
+    if poses is not None and str(poses) != NO_POSES:
+        return *read_posed(path, poses), Path(poses)
+    scene = read_scene(path)
+    looked_for = poses is None and path.is_file() and not may_be_run(path)
+    found = poses_nearby(path, scene) if looked_for else None
+    return (scene, None, None) if found is None else (scene, found.views, found.path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +91,21 @@ class PosesFile:
         """The same for a scene whose positions are relative to an offset, scene units."""
         return replace(self, views=self.views.relative_to(offset))
 
-    def check(self, scene: Gaussians) -> None:
+    def check(self, scene: Gaussians) -> bool:
         """Check by small renders, and by the photos that lie where the file says, that the views belong to a scene, to
         whose offset they are relative.
+
+        Returns:
+            Whether there were photos.
 
         Raises:
             DataError: if most views show nothing of the scene, or nothing sharp, or renders are not like the photos. A
                 scene without a visible Gaussian is not refused here.
         """
-        wrong = pose_faults(scene, self.views).text or likeness(scene, self._photos()).text()
+        photos = self._photos()
+        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text()
         if not wrong:
-            return
+            return bool(photos)
         mend = (
             "nerfstudio moves and scales scenes, and its run says how in dataparser_transforms.json; put that file "
             "beside the scene, or write the scene in the frame of its data (pointsplat convert RUN --original-frame)"

@@ -6,14 +6,14 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import check_photos, read_posed
+from pointsplat_ns.compression.posed_scene import check_photos, read_found
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
-from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.io.scene import save
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
@@ -110,7 +110,7 @@ def measure_tradeoff(
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
     with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
-        dense, given = (read_scene(path), None) if poses is None else read_posed(path, poses)
+        dense, given, file = read_found(path, poses)
         results = SWEEP_FILES.every
         check_journal_folder(
             folder,
@@ -120,7 +120,6 @@ def measure_tradeoff(
             [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
         )
         subject = subject_of(dense, path, given, resolution=size, up=upward, data=data)
-        file = None if poses is None else Path(poses)
         training = training_photos(path, data) if on_photos else None
         if training is not None:
             check_photos(dense, training, path)

@@ -34,6 +34,8 @@ class NamedViews:
     folders: Sequence[Path]
     """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model in the folders
     ``images`` of the project."""
+    in_scene_frame: bool = False
+    """Whether the format of the file says that its poses are in the frame of a trained scene."""
 
     def photo(self, index: int) -> Path | None:
         """The photo of a view; None if it does not lie in one of the folders or below."""
@@ -54,6 +56,16 @@ def is_camera_file(path: Path | str) -> bool:
             (path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META)
         )
     return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
+
+
+def camera_files_near(scene: Path) -> list[Path]:
+    """Files of cameras and COLMAP projects where training programs leave them: beside the file of a scene, the folder
+    of a training of 3DGS above ``point_cloud/iteration_N``, and a COLMAP project that holds the file or its folder."""
+    folder = scene.absolute().parent
+    roots = [folder.parents[1]] if folder.parent.name == "point_cloud" else []
+    files = [root / "cameras.json" for root in (*roots, folder)]
+    files += [folder / name for name in ("transforms_train.json", "transforms.json")]
+    return [*filter(Path.is_file, files), *(place for place in (folder, folder.parent) if model_folder(place))]
 
 
 def transforms_beside(path: Path | str) -> Path | None:
@@ -113,7 +125,7 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
         motion = found.saved.undone_before(Motion(exact, scale))
     names = [camera.name for camera in found.cameras]
     views = checked_views(path, found.cameras, motion)
-    return NamedViews(views, [names[index] for index in photo_order(names)], folders)
+    return NamedViews(views, [names[index] for index in photo_order(names)], folders, found.saved is None)
 
 
 def _json_cameras(path: Path) -> CameraFile:

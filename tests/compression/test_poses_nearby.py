@@ -1,0 +1,99 @@
+"""Files of cameras that lie beside a scene: which are used, which are not, and what is said."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from making import ball
+from pointsplat_ns.compacting import read_source
+from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.io.pictures import write_picture
+from posing import inria, name_of, nerfstudio, write_colmap_text
+
+
+@pytest.fixture(scope="module")
+def scene() -> ps.Gaussians:
+    return ball(500)
+
+
+@pytest.fixture(scope="module")
+def views(scene) -> ps.Views:
+    return ps.sample_views(scene, 6, 64, 48)
+
+
+@pytest.fixture()
+def said(caplog) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.INFO, logger="pointsplat_ns")
+    return caplog
+
+
+def known(path: Path, poses: str | None = None) -> ps.Views | None:
+    return read_source(path, poses, None)[1].given
+
+
+def same(found: ps.Views | None, views: ps.Views) -> bool:
+    return found is not None and torch.allclose(found.viewmats, views.viewmats.double(), atol=1e-5)
+
+
+def write_photos(scene, views, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, view in enumerate(views):
+        write_picture(ps.render(scene, view), folder / name_of(index))
+
+
+@pytest.mark.parametrize("place", ["point_cloud/iteration_30000/point_cloud.ply", "room.ply"])
+def test_cameras_that_3dgs_training_wrote_are_used_and_named(place, scene, views, tmp_path, said):
+    path = tmp_path / place
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ps.save(scene, path)
+    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
+    assert same(known(path), views)
+    assert f"poses: {tmp_path / 'cameras.json'}; --poses none" in said.text
+    assert known(path, "none") is None and known(path.parent / path.name, str(tmp_path / "cameras.json")) is not None
+
+
+def test_poses_of_another_frame_are_not_used(scene, views, tmp_path, said):
+    ps.save(scene, tmp_path / "room.ply")
+    poses = invert_rigid(views.viewmats.double())
+    poses[:, :3, 3] += 1000
+    (tmp_path / "cameras.json").write_text(json.dumps(inria(replace(views, viewmats=invert_rigid(poses)))))
+    assert known(tmp_path / "room.ply") is None and "cameras.json: not used for views: " in said.text
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "colmap", "colmap above"])
+def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, views, tmp_path, said):
+    """Their frame is that of the data, which may be another scene's."""
+    path = tmp_path / ("out/room.ply" if kind == "colmap above" else "room.ply")
+    path.parent.mkdir(exist_ok=True)
+    ps.save(scene, path)
+    if kind == "transforms.json":
+        (tmp_path / kind).write_text(json.dumps(nerfstudio(views)))
+    else:
+        write_colmap_text(views, tmp_path / "sparse" / "0")
+    assert known(path) is None and "no photos beside it tell whether it belongs to the scene" in said.text
+    write_photos(scene, views, tmp_path / "images")
+    assert same(known(path), views)
+    write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
+    assert known(path) is None and "no more like the photos of their views than like others" in said.text
+
+
+def test_commands_take_the_word_none(scene, views, tmp_path, capsys):
+    from pointsplat_ns.cli import main
+
+    ps.save(scene, tmp_path / "room.ply")
+    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
+    for words, named in (((), True), (("--poses", "none"), False)):
+        main(["prune", str(tmp_path / "room.ply"), "--keep", "100", "--force", *words])
+        assert ("cameras.json" in capsys.readouterr().out) == named
+
+
+def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
+    ps.save(scene, tmp_path / "room.ply")
+    (tmp_path / "cameras.json").write_text("[{}]")
+    (tmp_path / "transforms.json").write_text("{")
+    assert known(tmp_path / "room.ply") is None and said.text.count("not used for views") == 2
