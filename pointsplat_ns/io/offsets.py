@@ -66,12 +66,13 @@ def shift_of(rows: NDArray[np.void]) -> Offset | None:
     return offset_for(positions_of(rows), np.stack([rows[name].astype(np.float64) for name in names], axis=1))
 
 
-def with_shift(traits: Traits, shift: Offset | None, path: Path) -> Traits:
-    """The traits of a scene from whose positions ``shift`` is subtracted, which is logged."""
+def with_shift(traits: Traits, shift: Offset | None, path: Path | None) -> Traits:
+    """The traits of a scene from whose positions ``shift`` is subtracted, which is logged if there is a ``path``."""
     if shift is None:
         return traits
     x, y, z = (a + b for a, b in zip(traits.offset or (0.0, 0.0, 0.0), shift, strict=True))
-    logger.info("%s: positions are doubles; their offset %s is kept beside the scene", path, offset_text((x, y, z)))
+    if path is not None:
+        logger.info("%s: positions are doubles; their offset %s is kept beside the scene", path, offset_text((x, y, z)))
     return traits._replace(offset=(x, y, z))
 
 

@@ -105,11 +105,11 @@ class PlyRows:
             return None
         if warn:
             _report_unread(header, vertex, in_file, path)
-        return cls.of(path, header, vertex, in_file)
+        return cls.of(path, header, vertex, in_file, warn)
 
     @classmethod
-    def of(cls, path: Path, header: Header, vertex: Element, in_file: int) -> PlyRows:
-        """The rows of a file with what :func:`_checked` found in it."""
+    def of(cls, path: Path, header: Header, vertex: Element, in_file: int, warn: bool = True) -> PlyRows:
+        """The rows of a file with what :func:`_checked` found in it; an offset is logged if ``warn``."""
         dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
         start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
         rows = cls(path, vertex.count, min(in_file, MAX_REST), _traits(header, vertex, path), dtype, start, in_file)
@@ -117,7 +117,7 @@ class PlyRows:
             with rows._opened() as stream:
                 some = range(0, vertex.count, max(1, vertex.count // SAMPLED))
                 shift = shift_of(rows._table(b"".join(rows._row(number, stream) for number in some), len(some)))
-            rows = replace(rows, traits=with_shift(rows.traits, shift, path), _shift=shift)
+            rows = replace(rows, traits=with_shift(rows.traits, shift, path if warn else None), _shift=shift)
         return rows
 
     def __len__(self) -> int:

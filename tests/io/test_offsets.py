@@ -246,3 +246,10 @@ def test_a_ply_that_is_pruned_in_parts_keeps_its_offset_and_takes_poses_of_its_f
     whole, small = ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply")
     assert small.offset == whole.offset and len(small) == 2000
     assert np.abs(np.median(absolute(small), axis=0) - np.median(absolute(whole), axis=0)).max() < 0.5
+
+
+def test_commands_print_the_offset_once(tmp_path, capsys):
+    with_doubles(ball(300), tmp_path / "utm.ply")
+    for words in (["prune", "utm.ply", "--keep", "50"], ["convert", "utm.ply", "copy.ply"], ["info", "utm.ply"]):
+        main([words[0], str(tmp_path / words[1]), *(str(tmp_path / w) if w == "copy.ply" else w for w in words[2:])])
+        assert capsys.readouterr().out.count("positions are doubles") == 1, words
