@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.transforms import AXES
@@ -67,6 +68,7 @@ class _Activated(torch.autograd.Function):
         return value
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (value,) = ctx.saved_tensors
         moved = grad * value if ctx.function is torch.exp else grad * (1 - value) * value

@@ -63,7 +63,6 @@ RUNS = {
     "compact room.ply --keep 30% --effort instant --html small.html": "small.html",
     "lod room.ply --levels 30%": "1 levels of 600 Gaussians",
     "tradeoff room.ply --points 2 --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
-    "tables room.ply -o tables --only room/paper/10% --views 2 --side 64": "figure4.png",
     "convert room.ply room.spz": "600 Gaussians",
     "convert room.ply room.sog": "600 Gaussians",
     "convert room.ply room.glb": "600 Gaussians",

@@ -174,7 +174,6 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
         ("make-refiner --steps 1,000", "steps", 1000),
         ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
         ("demo --keep 20%", "keep", 0.2),
-        ("tables a.ply -o t --keeps 50% 0.1", "keeps", (0.5, 0.1)),
     ],
 )
 def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):

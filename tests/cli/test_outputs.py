@@ -33,7 +33,6 @@ FILES = (
 FOLDERS = (
     "lod gone.ply -o OUT",
     "tradeoff gone.ply -o OUT",
-    "tables gone.ply -o OUT",
     "render gone.ply -o OUT",
     "make-refiner -o OUT --rooms 0",
     "make-refiner -o a --weights OUT --rooms 0",

@@ -108,6 +108,4 @@ def test_each_place_that_starts_processes_is_known():
         "system/native_libraries.py",  # a compiler on PATH
         "system/programs.py",  # a program in an isolated Python
         "system/workers.py",  # Python itself, without the current folder on its path
-        "tables/making.py",  # splat-transform on PATH
-        "tables/measuring.py",  # git, in the folder of the package
     }

@@ -57,7 +57,7 @@ def test_prune_convert_and_export_say_what_they_wrote(ply, as_json):
     assert "gaussians_before" not in exported
 
 
-def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_lpips, tmp_path, monkeypatch):
+def test_lod_and_tradeoff_print_their_files(ply, as_json, plain_page, no_lpips, tmp_path, monkeypatch):
     assert as_json("lod", ply, "--levels", "50%") == {
         "output": "room_lod",
         **json.loads(Path("room_lod/lod.json").read_text("utf-8")),
@@ -70,10 +70,6 @@ def test_lod_tradeoff_and_tables_print_their_files(ply, as_json, plain_page, no_
     assert as_json("tradeoff", ply, *few) == {
         "output": "room_tradeoff",
         **json.loads(Path("room_tradeoff/tradeoff.json").read_text("utf-8")),
-    }
-    assert as_json("tables", ply, "-o", "tables", "--only", "room/dense/*", "--views", "2") == {
-        "output": "tables",
-        **json.loads(Path("tables/tables.json").read_text("utf-8")),
     }
 
 

@@ -57,7 +57,7 @@ def test_too_little_address_space_for_torch_is_one_line(gigabytes):
     [
         ["prune", ""], ["prune", "a.ply", "-o", ""], ["info", "a.ply", ""], ["convert", "a.ply", ""], ["view", ""],
         ["compact", "", "--keep", "10%"], ["render", "a.ply", "-o", ""], ["export", "", "-o", "a.ply"], ["lod", ""],
-        ["tradeoff", ""], ["train", ""], ["report", ""], ["tables", "", "-o", "t"], ["rooms", "-o", ""],
+        ["tradeoff", ""], ["train", ""], ["report", ""], ["rooms", "-o", ""],
         ["demo", "--output", ""],
         ["make-refiner", "-o", ""], ["make-feedback", ""], ["prune", "a.ply", "--poses", ""],
     ],

@@ -135,9 +135,9 @@ def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, dif
         dataparser_fields={"downscale_factor": case["downscale"]},
     )
     for name, value in (("open_run", known), ("dataset_views", poses), ("has_masks", case["masks"])):
-        monkeypatch.setattr(measure_tables, name, lambda *_, value=value: value)
+        monkeypatch.setattr(measure_tables, name, lambda *_, value=value, **options: value)
     shown = poses[: case["seen"]]
     photos = [torch.zeros(48, 64, 3) for _ in shown] if case["photos"] else None
     held_out = JudgedViews(shown, photos, "held-out photos")
     scene = ball(20, degree=case["sh_degree"])
-    assert measure_tables._differences(Path("run"), scene, held_out, held_out.resized(case["side"])) == differs
+    assert measure_tables._differences(Path("run"), None, scene, held_out, held_out.resized(case["side"])) == differs

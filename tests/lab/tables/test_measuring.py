@@ -43,7 +43,9 @@ def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer
     dense = cells["dense", 1.0].point
     for (way, share), cell in cells.items():
         assert cell.point.gaussians == round(400 * share) and cell.point.key == f"room/{way}/{100 * share:g}%"
-        assert cell.point.command.startswith("pointsplat tables ") and f"--only {cell.point.key}" in cell.point.command
+        assert (
+            cell.point.command.startswith("python -m lab.tables ") and f"--only {cell.point.key}" in cell.point.command
+        )
         assert cell.version == ps.__version__ and cell.seed == 0
         assert cell.point.against_photos is None and (cell.point.against_dense.psnr < 100 or cell.point == dense)
         assert (cell.opacities is not None) == ((way, share) in {(shown.name, kept) for shown, kept in WAYS.figure_4})
