@@ -22,14 +22,14 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 @dataclass(frozen=True)
 class HoldingSettings:
-    """From where on a loss is said."""
+    """Thresholds above which a loss is reported."""
 
     coarse: float = 0.25
     """Median step of positions, in sizes of Gaussians. At a quarter, renders have about 42 to 52 dB."""
     misplaced: float = 0.0025
     """Share of Gaussians with steps of positions above their largest size. Real splats have at most 0.0004."""
     share: float = 0.01
-    """Gaussians that lose something, as a share of all, or of their weight in pictures."""
+    """Share of the Gaussians that lose something, by number or by weight in pictures."""
     colour: float = 0.2
     """Error of the colour of a Gaussian in the direction in which it is largest, where 1 is white."""
     colour_step: float = 0.02
