@@ -268,8 +268,9 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
         try:
             for _ in range(threads - 1):
                 others.append(_pool(os.getpid()).submit(call))
-        except RuntimeError:  # the program is ending and starts no more threads
-            if threading.current_thread() is not threading.main_thread():
+        except RuntimeError as error:  # no more threads are started: this one does the rest
+            ending = "shutdown" in str(error)  # else the system has a limit
+            if ending and threading.current_thread() is not threading.main_thread():
                 raise SystemExit from None  # ends one of a viewer, for which nobody waits
         call()
     finally:
