@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, read_posed
+from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -120,9 +120,9 @@ def compact_source(
             from pointsplat_ns.tradeoff.finding import find_scene
             from pointsplat_ns.tradeoff.settings import repairs_of
 
-            given = views if isinstance(views, Views) else source.given
             size, upward = parse_resolution(resolution), up_named(up)
-            subject = subject_of(dense, run_of(scene, views), given, request.refiner, goal.suffix, size, upward, data)
+            run = run_of(scene, views)
+            subject = subject_of(dense, run, source.given, request.refiner, goal.suffix, size, upward, data)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
         quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
@@ -162,37 +162,34 @@ def read_source(
     if data is not None:
         from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
 
-        need_named_data(scene if views is None else views, data)
-    sampled = str(views) == NO_POSES
-    views = None if sampled else views
+        need_named_data(scene if views is None or _sampled(views) else views, data)
+    poses: Path | str | None = NO_POSES if isinstance(views, Views) else None
     if isinstance(views, (str, Path)):
         from pointsplat_ns.io.camera_files import is_camera_file
 
-        if not Path(views).exists():
+        if not _sampled(views) and not Path(views).exists():
             raise SceneError(
                 f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of "
                 "cameras"
             )
-        if is_camera_file(views):
-            dense, views = read_posed(scene, views)
-            return dense, ViewSource(dense, given=views, resolution=size, up=upward)
-    if isinstance(scene, Gaussians):
-        dense, found = scene, None
-    else:
-        dense, found, _ = read_found(Path(scene), None if views is None and not sampled else NO_POSES)
-    if isinstance(views, Views):
-        found = views
-    if found is not None:
-        return dense, ViewSource(dense, given=found, resolution=size, up=upward)
-    run = run_of(scene, views)
+        poses = views if not _sampled(views) and is_camera_file(views) else NO_POSES
+    dense, found, _ = read_found(scene, poses)
+    given = views if isinstance(views, Views) else found
     read = functools.partial(_dataset_views, data=data)
-    return dense, ViewSource(dense, run=run, dataset_views=read, resolution=size, up=upward)
+    return dense, ViewSource(dense, given, run_of(scene, views), read, size, up=upward)
 
 
 def run_of(scene: Source, views: ViewsInput) -> Path | None:
-    """The file or folder whose dataset may have the poses."""
+    """The file or folder whose dataset may have the poses; None if views are to be sampled."""
+    if _sampled(views):
+        return None
     named = scene if views is None else views
     return Path(named) if isinstance(named, (str, Path)) else None
+
+
+def _sampled(views: ViewsInput) -> bool:
+    """Whether views are to be sampled, whatever is known."""
+    return isinstance(views, (str, Path)) and str(views) == NO_POSES
 
 
 def _training_photos(run: Path | None, data: DataInput) -> Photos:

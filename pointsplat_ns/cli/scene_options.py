@@ -119,7 +119,9 @@ def scene_written(output: Path | None) -> Iterator[None]:
 
 def check_poses(poses: Path | None) -> None:
     """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
-    if poses is None or str(poses) == "none":
+    from pointsplat_ns.compression.posed_scene import NO_POSES
+
+    if poses is None or str(poses) == NO_POSES:
         return
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file

@@ -51,15 +51,18 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     return None
 
 
-def read_found(path: Path, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
+def read_found(scene: Gaussians | Path | str, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
     """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. Errors are
     those of :func:`read_posed`."""
     if poses is not None and str(poses) != NO_POSES:
-        return *read_posed(path, poses), Path(poses)
-    scene = read_scene(path)
+        return *read_posed(scene, poses), Path(poses)
+    if isinstance(scene, Gaussians):
+        return scene, None, None
+    path = Path(scene)
+    dense = read_scene(path)
     looked_for = poses is None and path.is_file() and not may_be_run(path)
-    found = poses_nearby(path, scene) if looked_for else None
-    return (scene, None, None) if found is None else (scene, found.views, found.path)
+    found = poses_nearby(path, dense) if looked_for else None
+    return (dense, None, None) if found is None else (dense, found.views, found.path)
 
 
 @dataclass(frozen=True, eq=False)

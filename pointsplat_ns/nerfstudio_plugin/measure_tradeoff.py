@@ -6,7 +6,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import check_photos, read_found
+from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
@@ -119,11 +119,19 @@ def measure_tradeoff(
             force,
             [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
         )
-        subject = subject_of(dense, path, given, resolution=size, up=upward, data=data)
+        sampled = str(poses) == NO_POSES
+        subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
         training = training_photos(path, data) if on_photos else None
         if training is not None:
             check_photos(dense, training, path)
-        subject = replace(subject, name=name_of(path), sha256=source_file(path).sha256, poses=file, training=training)
+        subject = replace(
+            subject,
+            path=path,
+            name=name_of(path),
+            sha256=source_file(path).sha256,
+            poses=Path(NO_POSES) if sampled else file,
+            training=training,
+        )
         sweep = Sweep(subject, folder, options, report)
         if targets is None:
             return sweep.run()

@@ -35,7 +35,7 @@ Camera = tuple[Tensor, Tensor, Lens]
 
 def _placed(
     scene: Gaussians, camera: Camera, colored: bool, quality: Quality, most_pairs: int
-) -> tuple[KernelInputs, Tensor, Tensor, int] | None:
+) -> tuple[KernelInputs, Tensor, Tensor, list[Tensor]] | None:
     """What is drawn on which tile.
 
     Args:
@@ -47,7 +47,8 @@ def _placed(
 
     Returns:
         The table of Gaussians, the Gaussians of each tile front to back (P,), where those of each tile start
-        (tiles + 1,), both int64, and the number of Gaussians that no camera can draw; None if the pairs are too many.
+        (tiles + 1,), both int64, and the means, quaternions, standard deviations and opacities of the Gaussians as the
+        kernels read them; None if the pairs are too many.
     """
     library, count = KERNELS.library, len(scene)
     with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
@@ -83,7 +84,7 @@ def _placed(
     pairs = torch.empty(total, **INDICES)
     task.fill(offsets=offsets, pairs=pairs)
     library.pointsplat_list(task, drawn, offsets[:-1].clone())
-    return inputs, pairs, offsets, count_meaningless(*tensors)
+    return inputs, pairs, offsets, tensors
 
 
 def _whole(lens: Lens) -> Region:
@@ -97,14 +98,14 @@ def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int)
     found = _placed(scene, camera, True, quality, most_pairs)
     if found is None:
         return None
-    (inputs, pairs, offsets, skipped), lens = found, camera[2]
+    (inputs, pairs, offsets, tensors), lens = found, camera[2]
     whole, count = _whole(lens), offsets.numel() - 1
     image, final = torch.empty(count, 3, PIXELS, **FLOATS), torch.empty(count, PIXELS, **FLOATS)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
     on_threads(pairs.numel() >= SEVERAL, blending.KERNELS.library.pointsplat_blend, task)
     colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
-    return colors, 1.0 - through, skipped
+    return colors, 1.0 - through, count_meaningless(*tensors)
 
 
 def weights(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> Tensor | None:

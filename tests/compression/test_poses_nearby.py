@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball
+from making import ball, run_of
 from pointsplat_ns.compacting import read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.pictures import write_picture
@@ -97,3 +97,17 @@ def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
     (tmp_path / "cameras.json").write_text("[{}]")
     (tmp_path / "transforms.json").write_text("{")
     assert known(tmp_path / "room.ply") is None and said.text.count("not used for views") == 2
+
+
+def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
+    run = run_of(trained_walls, "wall-a")
+    assert read_source(run, None, None)[1].known(3) is not None
+    assert read_source(run, "none", None)[1].known(3) is None
+
+
+def test_commands_of_a_sweep_of_sampled_views_say_so(trained_walls, tmp_path):
+    run = run_of(trained_walls, "wall-a")
+    options = {"points": 2, "repairs": ("none",), "views": 2, "resolution": "64x48"}
+    ps.measure_tradeoff(run, tmp_path / "out", poses="none", **options)
+    points = (tmp_path / "out" / "points.json").read_text()
+    assert f"pointsplat prune {run} " in points and "--poses none" in points and "sampled" in points
