@@ -198,7 +198,7 @@ def compact(
             refiner.
         sh: SH bands to keep, as for :func:`prune`.
         clean: as for :func:`prune`.
-        effort: "instant" takes no steps; "quick" and "thorough" take 48 and 400.
+        effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
             or for ``seconds``. Photos in and outside of the steps say whether the result is better.

@@ -1,4 +1,4 @@
-"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in a new view."""
+"""Repairs a smaller scene by learned optimisation steps against renders of the dense scene, each in another view."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ def repair(
 
     Each step renders both scenes in one view. A network reads the gradients of each Gaussian and sets how far it moves
     (:mod:`~pointsplat_ns.refiner.feedback`). The views come from :meth:`ViewSource.others`: other views than those of
-    comparisons, and no sampled view twice, which prevents overfitting. Ctrl-C ends the repair, and the scene of the
-    last step is returned.
+    comparisons, each once before any is repeated. Ctrl-C ends the repair, and the scene of the last step is returned.
 
     Args:
         scene: K Gaussians; not changed.

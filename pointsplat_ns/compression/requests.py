@@ -32,7 +32,7 @@ SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 
 Effort = Literal["instant", "quick", "thorough"]
 
-STEPS: dict[Effort, int] = {"instant": 0, "quick": 48, "thorough": 400}
+STEPS: dict[Effort, int] = {"instant": 0, "quick": 192, "thorough": 1200}
 """Number of repair steps of each effort."""
 
 

@@ -338,9 +338,6 @@ class LookingSettings:
 
     # Views to optimise on (view_source.py)
 
-    sampled_at_once: int = 32
-    """Number of views that are sampled at a time."""
-
     opposite_background_every: int = 5
     """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
     knows before which one the scene is shown; 0 turns the rule off. Odd, so that both sizes of pictures have both."""

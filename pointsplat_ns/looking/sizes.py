@@ -81,10 +81,10 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
 
 
 def two_sizes(views: Views, settings: LookingSettings = LOOKING) -> tuple[Views, Views]:
-    """Views :func:`middle_sized`, and views of as many pixels, subsampled from the whole size: to optimise on in
-    turn."""
-    middle = middle_sized(views, settings)
-    return middle, subsampled(views, max(views.width, views.height), max(middle.width, middle.height))
+    """Views to optimise on, of two sizes: subsampled from pictures of the middle one of their :func:`sides_of`, and
+    from whole ones. Drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
+    sides = sides_of(views.width, views.height, settings)
+    return subsampled(views, sides[len(sides) // 2]), subsampled(views, sides[-1])
 
 
 class RendersOfSizes:

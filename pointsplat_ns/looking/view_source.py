@@ -28,6 +28,8 @@ class ViewCounts:
     """Known views from which merging computes visibility weights."""
     compared: int = 12
     """Views in which renders are compared."""
+    stepped: int = 96
+    """Sampled views for the steps of repairs."""
     scored: int = 40
     """Views for fine-tuning and for methods that score by views."""
     opening: int = 24
@@ -165,11 +167,11 @@ class ViewSource:
         return middle_sized(self.views(count), self._settings)
 
     def others(self, seed: int = 0) -> Iterator[View]:
-        """Views to optimise on, without end: none of the :meth:`compared` ones. In turn they are of the same size, and
-        subsampled from their full size.
+        """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
+        is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
+        (:func:`~pointsplat_ns.looking.sizes.two_sizes`), the next time the other way around.
 
-        Known views come in random order, each once before any is repeated. If they are too few beside the compared
-        ones, new views are sampled without end.
+        They are known views; if these are too few beside the compared ones, sampled ones.
 
         Args:
             seed: seed of the order, and of sampled views.
@@ -179,32 +181,35 @@ class ViewSource:
         """
         compared = self.compared()
         known = self.given if self.given is not None else self._of_dataset
-        if known is not None and len(known) > 2 * len(compared):
-            left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
-            rest, generator = two_sizes(self._at_resolution(known), self._settings), random.Random(seed)
-            for turn, index in enumerate(drawn for _ in counted() for drawn in generator.sample(left, len(left))):
-                yield rest[turn % 2][index]
-        yield from self.sampled(seed)
+        if known is None or len(known) <= 2 * len(compared):
+            yield from self.sampled(seed)
+            return
+        left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
+        yield from self._in_turn(self._at_resolution(known)[left], seed)
 
     def sampled(self, seed: int = 0) -> Iterator[View]:
-        """Sampled views without end, of the sizes of :meth:`others`.
+        """Sampled views without end, in the order and of the sizes of :meth:`others`.
 
         Args:
-            seed: of the sampler.
+            seed: of the order, and of the sampler.
 
         Raises:
             DataError: if none can be sampled.
         """
         compared, known = self.compared(), self.given is not None or self._of_dataset is not None
-        at_once, every = self._settings.sampled_at_once, self._settings.opposite_background_every
-        for batch in counted(1):
-            sampled = dataclasses.replace(
-                self.sampler.views(at_once, at_once * seed + batch),
-                background=compared.background,
-                rasterize_mode=compared.rasterize_mode,
-            )
-            sizes = two_sizes(sampled, self._settings)
-            for turn, index in enumerate(random.Random(batch).sample(range(len(sampled)), len(sampled))):
-                view = sizes[turn % 2][index]
-                opposite = not known and every > 0 and turn % every == every - 1
-                yield dataclasses.replace(view, background=1 - view.background) if opposite else view
+        views = dataclasses.replace(
+            self.sampler.views(VIEW_COUNTS.stepped, seed + 1),
+            background=compared.background,
+            rasterize_mode=compared.rasterize_mode,
+        )
+        every = self._settings.opposite_background_every
+        for turn, view in enumerate(self._in_turn(views, seed)):
+            opposite = not known and every > 0 and turn % every == every - 1
+            yield dataclasses.replace(view, background=1 - view.background) if opposite else view
+
+    def _in_turn(self, views: Views, seed: int) -> Iterator[View]:
+        """Views in random order, each once before any is repeated, then of the other size; without end."""
+        sizes, generator = two_sizes(views, self._settings), random.Random(seed)
+        for lap in counted():
+            for index in generator.sample(range(len(views)), len(views)):
+                yield sizes[(lap + index) % 2][index]

@@ -100,6 +100,26 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     assert first != second
 
 
+def test_steps_draw_few_pixels_of_each_view_as_of_two_sizes(hollow_ball):
+    source = ViewSource(hollow_ball, given=sample_views(hollow_ball, 40, 640, 480))
+    taken = list(itertools.islice(source.others(), 56))
+    assert {(view.width, view.height) for view in taken} == {(320, 240)}
+    widened: dict[tuple[float, ...], set[float]] = {}
+    for view in taken:
+        widened.setdefault(tuple(view.viewmat.flatten().tolist()), set()).add(round(view.eps2d, 4))
+    of_both = {round(0.3 * (320 / side) ** 2, 4) for side in (453, 640)}
+    assert len(widened) == 28 and all(found == of_both for found in widened.values())
+
+
+def test_views_are_sampled_once_and_seen_again_in_another_order(hollow_ball):
+    source = ViewSource(hollow_ball, resolution=(64, 48))
+    count = VIEW_COUNTS.stepped
+    taken = [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.sampled(), 2 * count)]
+    assert len(set(taken[:count])) == count and set(taken[:count]) == set(taken[count:])
+    assert taken[:count] != taken[count:]
+    assert set(taken) != {tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.sampled(1), count)}
+
+
 def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(hollow_ball):
     few = sample_views(hollow_ball, 3, 48, 36)
     white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
