@@ -55,7 +55,11 @@ def distance_to_others(points: Tensor, k: int) -> Tensor:
 
 
 def finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
-    """Positions and colours as float32 without rows that are not finite; None if nothing is left."""
+    """Positions (N, 3) and colours (N, 3) as float32 without rows that are not finite; None if nothing is left.
+
+    If all colours are black they are unknown, (0, 3), as in COLMAP models whose points were triangulated without
+    photos. Renders clamp colours at black, where they have no gradient: the scene would stay black.
+    """
     if seeds is None:
         return None
     points, colors = (value.detach().float().cpu() for value in seeds)
@@ -68,4 +72,7 @@ def finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] |
     if not finite.any():
         CONSOLE.log("no seed points are left; training starts from random ones")
         return None
+    if len(colors) > 0 and not colors.any():
+        CONSOLE.log("all seed points are black, as where colours are unknown; training starts from random colours")
+        colors = colors[:0]
     return points[finite].clone(), colors.clone()

@@ -123,6 +123,20 @@ def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropp
         assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9, "random ones"
 
 
+def test_seeds_that_are_all_black_start_from_random_colours_that_training_can_change():
+    points, colors = random_seeds(50)
+    for degree in (0, 3):
+        config = SplatfactoCpuModelConfig(sh_degree=degree, background_color="black")
+        black = build(config, (points, torch.zeros(50, 3)))
+        assert torch.equal(black.means.detach(), points.float()) and len(black.features_dc.unique()) > 100
+        black.eval()
+        black.get_outputs(camera_at())["rgb"].sum().backward()
+        assert black.features_dc.grad.abs().max() > 0
+        one = torch.zeros(50, 3)
+        one[0, 1] = 200.0
+        assert len(build(config, (points, one)).features_dc.unique()) == 2, "dark points among others stay"
+
+
 def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
     config = wall_config(tmp_path / "no_such_scene", tmp_path / "outputs", steps=5)
     (tmp_path / "outputs").mkdir()
