@@ -208,7 +208,8 @@ fill, and views look from enclosed places of what is no room as a whole (both ap
 [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}.
 Rows of captures are older than those of splats: merging sampled 48 views then, 24 now, and a
-repair saw pictures of one size."""
+repair saw pictures of one size. All rows of `compact` are of repairs of 48 steps; 192 in pictures of 320 pixels
+gain 0.2 to 1.1 dB on seven splats at 10 %, in 1.2 to 1.5 times the CPU seconds."""
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 
