@@ -171,7 +171,8 @@ class ViewSource:
         is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
         (:func:`~pointsplat_ns.looking.sizes.two_sizes`), the next time the other way around.
 
-        They are known views; if these are too few beside the compared ones, sampled ones.
+        They are known views; if these are fewer than the compared ones, known and sampled ones in turn; if all known
+        ones are compared, or there are none, sampled ones.
 
         Args:
             seed: seed of the order, and of sampled views.
@@ -181,11 +182,16 @@ class ViewSource:
         """
         compared = self.compared()
         known = self.given if self.given is not None else self._of_dataset
-        if known is None or len(known) <= 2 * len(compared):
+        count = 0 if known is None else len(known)
+        left = sorted(set(range(count)) - set(spread_indices(count, VIEW_COUNTS.compared)))
+        if known is None or not left:
             yield from self.sampled(seed)
             return
-        left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
-        yield from self._in_turn(self._at_resolution(known)[left], seed)
+        of_known = self._in_turn(self._at_resolution(known)[left], seed)
+        if len(left) > len(compared):
+            yield from of_known
+        for pair in zip(of_known, self.sampled(seed), strict=False):  # neither ends
+            yield from pair
 
     def sampled(self, seed: int = 0) -> Iterator[View]:
         """Sampled views without end, in the order and of the sizes of :meth:`others`.

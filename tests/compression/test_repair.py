@@ -120,6 +120,16 @@ def test_views_are_sampled_once_and_seen_again_in_another_order(hollow_ball):
     assert set(taken) != {tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.sampled(1), count)}
 
 
+def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_ball):
+    given = sample_views(hollow_ball, 20, 48, 36)
+    source = ViewSource(hollow_ball, given=given)
+    compared = {tuple(m.flatten().tolist()) for m in source.compared().viewmats}
+    left = {tuple(m.flatten().tolist()) for m in given.viewmats} - compared
+    taken = [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(), 32)]
+    assert len(left) == 8 and set(taken[::2]) == left
+    assert len(set(taken[1::2])) == 16 and not set(taken[1::2]) & (left | compared)
+
+
 def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(hollow_ball):
     few = sample_views(hollow_ball, 3, 48, 36)
     white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
