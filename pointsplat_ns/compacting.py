@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found
+from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -162,17 +162,17 @@ def read_source(
     if data is not None:
         from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
 
-        need_named_data(scene if views is None or _sampled(views) else views, data)
-    poses: Path | str | None = NO_POSES if isinstance(views, Views) else None
-    if isinstance(views, (str, Path)):
+        need_named_data(scene if views is None or without_poses(views) else views, data)
+    poses: Path | str | None = None if views is None else NO_POSES
+    if isinstance(views, (str, Path)) and not without_poses(views):
         from pointsplat_ns.io.camera_files import is_camera_file
 
-        if not _sampled(views) and not Path(views).exists():
+        if not Path(views).exists():
             raise SceneError(
                 f"{views}: no such file or folder; expected views, a run whose dataset has the poses, or a file of "
                 "cameras"
             )
-        poses = views if not _sampled(views) and is_camera_file(views) else NO_POSES
+        poses = views if is_camera_file(views) else NO_POSES
     dense, found, _ = read_found(scene, poses)
     given = views if isinstance(views, Views) else found
     read = functools.partial(_dataset_views, data=data)
@@ -181,15 +181,10 @@ def read_source(
 
 def run_of(scene: Source, views: ViewsInput) -> Path | None:
     """The file or folder whose dataset may have the poses; None if views are to be sampled."""
-    if _sampled(views):
+    if without_poses(views):
         return None
     named = scene if views is None else views
     return Path(named) if isinstance(named, (str, Path)) else None
-
-
-def _sampled(views: ViewsInput) -> bool:
-    """Whether views are to be sampled, whatever is known."""
-    return isinstance(views, (str, Path)) and str(views) == NO_POSES
 
 
 def _training_photos(run: Path | None, data: DataInput) -> Photos:

@@ -119,14 +119,13 @@ def scene_written(output: Path | None) -> Iterator[None]:
 
 def check_poses(poses: Path | None) -> None:
     """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
-    from pointsplat_ns.compression.posed_scene import NO_POSES
-
-    if poses is None or str(poses) == NO_POSES:
+    if poses is None:
         return
+    from pointsplat_ns.compression.posed_scene import without_poses
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file
 
-    if not is_camera_file(poses):
+    if not (without_poses(poses) or is_camera_file(poses)):
         raise SceneError(
             f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own dataset need no --poses"
         )

@@ -31,6 +31,11 @@ NO_POSES = "none"
 """In place of a file of cameras: views are sampled, whatever lies beside the scene."""
 
 
+def without_poses(poses: object) -> bool:
+    """Whether what stands for poses is :data:`NO_POSES`."""
+    return isinstance(poses, (str, Path)) and str(poses) == NO_POSES
+
+
 def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
     """Views from a file of cameras that lies beside a scene's file or above it, see
     :func:`~pointsplat_ns.io.camera_files.camera_files_near`; None if there is none that belongs to the scene.
@@ -54,7 +59,7 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
 def read_found(scene: Gaussians | Path | str, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
     """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. Errors are
     those of :func:`read_posed`."""
-    if poses is not None and str(poses) != NO_POSES:
+    if poses is not None and not without_poses(poses):
         return *read_posed(scene, poses), Path(poses)
     if isinstance(scene, Gaussians):
         return scene, None, None

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import NO_POSES, PosesFile
+from pointsplat_ns.compression.posed_scene import PosesFile, without_poses
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -135,7 +135,7 @@ def prune_file(
     if request.sh.isdigit():
         rows = replace(rows, rest=min(rows.rest, (int(request.sh) + 1) ** 2 - 1))
     most = _most_in_cell(rows, memory)
-    given = None if poses is None or str(poses) == NO_POSES else poses
+    given = None if poses is None or without_poses(poses) else poses
     file = None if given is None else PosesFile.of(rows.path, given).relative_to(rows.traits.offset)
     known = None if file is None else file.views
     if known is not None and resolution is not None:

@@ -340,7 +340,7 @@ class LookingSettings:
 
     opposite_background_every: int = 5
     """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
-    knows before which one the scene is shown; 0 turns the rule off. Odd, so that both sizes of pictures have both."""
+    knows before which one the scene is shown; 0 turns the rule off."""
 
 
 LOOKING = LookingSettings()

@@ -60,10 +60,15 @@ def sides_of(width: int, height: int, settings: LookingSettings = LOOKING) -> tu
     return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
 
 
-def middle_sized(views: Views, settings: LookingSettings = LOOKING) -> Views:
-    """Views at the middle one of their :func:`sides_of`: nearly as large as people look at, and quick to draw."""
+def middle_side(views: Views, settings: LookingSettings = LOOKING) -> int:
+    """The middle one of the :func:`sides_of` views, pixels."""
     sides = sides_of(views.width, views.height, settings)
-    return views.resized(sides[len(sides) // 2])
+    return sides[len(sides) // 2]
+
+
+def middle_sized(views: Views, settings: LookingSettings = LOOKING) -> Views:
+    """Views at their :func:`middle_side`: nearly as large as people look at, and quick to draw."""
+    return views.resized(middle_side(views, settings))
 
 
 def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
@@ -81,10 +86,9 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
 
 
 def two_sizes(views: Views, settings: LookingSettings = LOOKING) -> tuple[Views, Views]:
-    """Views to optimise on, of two sizes: subsampled from pictures of the middle one of their :func:`sides_of`, and
-    from whole ones. Drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
-    sides = sides_of(views.width, views.height, settings)
-    return subsampled(views, sides[len(sides) // 2]), subsampled(views, sides[-1])
+    """Views to optimise on, of two sizes: subsampled from pictures of their :func:`middle_side`, and from whole ones.
+    Drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
+    return subsampled(views, middle_side(views, settings)), subsampled(views, max(views.width, views.height))
 
 
 class RendersOfSizes:

@@ -135,12 +135,15 @@ class ViewSource:
         """
         return self.sampler.up
 
+    @property
+    def _known(self) -> Views | None:
+        """All known views: given ones, or those of the dataset's training poses; None if there are none."""
+        return self._of_dataset if self.given is None else self.given
+
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
         none."""
-        if self.given is None and self._of_dataset is None:
-            return None
-        return self.views(count)
+        return None if self._known is None else self.views(count)
 
     def for_merging(self) -> Views | Sampler:
         """At most :data:`VIEW_COUNTS.weighed` known views; the sampler if there are none."""
@@ -180,37 +183,41 @@ class ViewSource:
         Raises:
             DataError: if none can be sampled.
         """
-        compared = self.compared()
-        known = self.given if self.given is not None else self._of_dataset
-        count = 0 if known is None else len(known)
-        left = sorted(set(range(count)) - set(spread_indices(count, VIEW_COUNTS.compared)))
-        if known is None or not left:
+        compared, left = self.compared(), self._not_compared()
+        if left is None:
             yield from self.sampled(seed)
-            return
-        of_known = self._in_turn(self._at_resolution(known)[left], seed)
-        if len(left) > len(compared):
-            yield from of_known
-        for pair in zip(of_known, self.sampled(seed), strict=False):  # neither ends
-            yield from pair
+        elif len(left) > len(compared):
+            yield from self._in_turn(left, seed)
+        else:
+            for pair in zip(self._in_turn(left, seed), self.sampled(seed), strict=False):  # neither ends
+                yield from pair
 
-    def sampled(self, seed: int = 0) -> Iterator[View]:
+    def _not_compared(self) -> Views | None:
+        """The known views that are none of the :meth:`compared` ones; None if there are none."""
+        if (known := self._known) is None:
+            return None
+        left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
+        return self._at_resolution(known)[left] if left else None
+
+    def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
         """Sampled views without end, in the order and of the sizes of :meth:`others`.
 
         Args:
             seed: of the order, and of the sampler.
+            count: number of different ones.
 
         Raises:
             DataError: if none can be sampled.
         """
-        compared, known = self.compared(), self.given is not None or self._of_dataset is not None
+        compared = self.compared()
         views = dataclasses.replace(
-            self.sampler.views(VIEW_COUNTS.stepped, seed + 1),
+            self.sampler.views(count, seed + 1),
             background=compared.background,
             rasterize_mode=compared.rasterize_mode,
         )
         every = self._settings.opposite_background_every
         for turn, view in enumerate(self._in_turn(views, seed)):
-            opposite = not known and every > 0 and turn % every == every - 1
+            opposite = self._known is None and every > 0 and turn % every == every - 1
             yield dataclasses.replace(view, background=1 - view.background) if opposite else view
 
     def _in_turn(self, views: Views, seed: int) -> Iterator[View]:

@@ -6,7 +6,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found
+from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
@@ -119,7 +119,7 @@ def measure_tradeoff(
             force,
             [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
         )
-        sampled = str(poses) == NO_POSES
+        sampled = without_poses(poses)
         subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
         training = training_photos(path, data) if on_photos else None
         if training is not None:

@@ -25,6 +25,10 @@ def quick_takes_steps(monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 32)
 
 
+def place(viewmat):
+    return tuple(viewmat.flatten().tolist())
+
+
 @pytest.fixture(scope="module")
 def pruned(hollow_ball):
     return prune(hollow_ball, 300, "merge")
@@ -90,11 +94,8 @@ def test_a_budget_that_means_nothing_is_refused(effort, seconds, message):
 def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     many = sample_views(hollow_ball, 40, 48, 36)
     source = ViewSource(hollow_ball, given=many)
-    compared = {tuple(m.flatten().tolist()) for m in source.compared().viewmats}
-    first, second = (
-        [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(seed), 56)]
-        for seed in (0, 1)
-    )
+    compared = {place(m) for m in source.compared().viewmats}
+    first, second = ([place(view.viewmat) for view in itertools.islice(source.others(seed), 56)] for seed in (0, 1))
     assert len(compared) == VIEW_COUNTS.compared and not compared & set(first)
     assert len(set(first[:28])) == 28 and set(first[:28]) == set(first[28:]), "each once before any is repeated"
     assert first != second
@@ -106,7 +107,7 @@ def test_steps_draw_few_pixels_of_each_view_as_of_two_sizes(hollow_ball):
     assert {(view.width, view.height) for view in taken} == {(320, 240)}
     widened: dict[tuple[float, ...], set[float]] = {}
     for view in taken:
-        widened.setdefault(tuple(view.viewmat.flatten().tolist()), set()).add(round(view.eps2d, 4))
+        widened.setdefault(place(view.viewmat), set()).add(round(view.eps2d, 4))
     of_both = {round(0.3 * (320 / side) ** 2, 4) for side in (453, 640)}
     assert len(widened) == 28 and all(found == of_both for found in widened.values())
 
@@ -114,18 +115,18 @@ def test_steps_draw_few_pixels_of_each_view_as_of_two_sizes(hollow_ball):
 def test_views_are_sampled_once_and_seen_again_in_another_order(hollow_ball):
     source = ViewSource(hollow_ball, resolution=(64, 48))
     count = VIEW_COUNTS.stepped
-    taken = [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.sampled(), 2 * count)]
+    taken = [place(view.viewmat) for view in itertools.islice(source.sampled(), 2 * count)]
     assert len(set(taken[:count])) == count and set(taken[:count]) == set(taken[count:])
     assert taken[:count] != taken[count:]
-    assert set(taken) != {tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.sampled(1), count)}
+    assert set(taken) != {place(view.viewmat) for view in itertools.islice(source.sampled(1), count)}
 
 
 def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_ball):
     given = sample_views(hollow_ball, 20, 48, 36)
     source = ViewSource(hollow_ball, given=given)
-    compared = {tuple(m.flatten().tolist()) for m in source.compared().viewmats}
-    left = {tuple(m.flatten().tolist()) for m in given.viewmats} - compared
-    taken = [tuple(view.viewmat.flatten().tolist()) for view in itertools.islice(source.others(), 32)]
+    compared = {place(m) for m in source.compared().viewmats}
+    left = {place(m) for m in given.viewmats} - compared
+    taken = [place(view.viewmat) for view in itertools.islice(source.others(), 32)]
     assert len(left) == 8 and set(taken[::2]) == left
     assert len(set(taken[1::2])) == 16 and not set(taken[1::2]) & (left | compared)
 
@@ -134,8 +135,8 @@ def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(holl
     few = sample_views(hollow_ball, 3, 48, 36)
     white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
     taken = list(itertools.islice(ViewSource(hollow_ball, given=white).others(), 40))
-    places = {tuple(view.viewmat.flatten().tolist()) for view in taken}
-    assert len(places) == 40 and not places & {tuple(m.flatten().tolist()) for m in few.viewmats}
+    places = {place(view.viewmat) for view in taken}
+    assert len(places) == 40 and not places & {place(m) for m in few.viewmats}
     assert all(view.background.tolist() == [1, 1, 1] for view in taken)
 
 

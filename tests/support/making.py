@@ -17,7 +17,7 @@ import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.system.kernels import on_threads
 from pointsplat_ns.system.threads import fixed_threads
 
@@ -339,7 +339,7 @@ def decoded(path: Path) -> list[np.ndarray]:
 class FewViews(ViewSource):
     """Fresh views of 48 x 36 pixels."""
 
-    def sampled(self, seed: int = 0):
+    def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped):
         for number in itertools.count(1):
             yield from sample_views(self._scene, 8, 48, 36, seed=number)
 

@@ -21,7 +21,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
+from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.pruning.duplicates import Copies, Reduced
 from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
 from pointsplat_ns.pruning.merging.groups import merged_groups
@@ -329,5 +329,4 @@ def _reference(
     if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
     views = participants.views_in_units(viewpoints.views.spread(settings.finish_views))
-    sides = sides_of(views.width, views.height)
-    return RendersOfSizes(participants.in_units(dense()), views, [sides[len(sides) // 2]])
+    return RendersOfSizes(participants.in_units(dense()), views, [middle_side(views)])
