@@ -182,10 +182,8 @@ def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos in random order, each once before any is repeated, and renders of the dense scene; without end."""
-    generator, places = (
-        random.Random(0),
-        islice(views.sampled(count=PHOTO_REPAIR.dense_views), PHOTO_REPAIR.dense_views),
-    )
+    generator, count = random.Random(0), PHOTO_REPAIR.dense_views
+    places = islice(views.sampled(count=count), count)
     renders = cycle(Example(view, render(dense, view)) for view in places)  # which keeps them
     order = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):

@@ -130,7 +130,7 @@ def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page
 def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, plain_page, no_lpips, monkeypatch):
     monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-    monkeypatch.setitem(PHOTO_STEPS, "quick", 24)
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 96)
     found = ps.measure_tradeoff(run, tmp_path / "trade", points=3, repairs=("none", "photos"))
     trained = next(point for point in found.points if point.repair == "photos")
     pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
