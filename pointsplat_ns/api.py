@@ -131,7 +131,7 @@ def prune(
         fine_tune: number of optimisation steps of the result against renders of the given scene.
         views: cameras for all rendering: views, the run whose dataset has the poses, or a file of cameras
             (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
-            default those of the run at ``scene``, or poses sampled in free space.
+            default those of the run at ``scene``, or sampled poses.
         resolution: width and height of the pictures that people look at, pixels: (1920, 1080) or "1920x1080".
             Decisions by rendering are made at this size. By default the size of the photos or of given views, else
             1920 x 1080.
@@ -208,7 +208,7 @@ def compact(
         target_mb: largest file, in units of 10^6 bytes.
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
-            there are more than twice as many; else it samples views in free space.
+            there are more than twice as many; else it samples views.
         resolution: as for :func:`prune`.
         up: as for :func:`prune`.
         data: as for :func:`prune`.

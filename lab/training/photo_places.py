@@ -53,17 +53,18 @@ def asked(run: Path, sh: int) -> Map:
     dense, poses = ps.load(run), dataset_views(run, "train")
     dense = cut_sh(dense, sh) if dense.sh_degree > sh else dense
     eyes = invert_rigid(poses.viewmats.double())[:, :3, 3]
-    evidence = PhotoEvidence.of(dense, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    evidence = PhotoEvidence.of(dense, generator)
     if len(evidence.means) == 0:
         raise SystemExit(f"{run} has no opaque Gaussian")
     size = content_size(dense)[1]
     anywhere = evidence.candidates(ANY, torch.Generator().manual_seed(0))
-    found = photo_places(dense)
+    found = photo_places(evidence, generator)
     at_eyes, at_any = evidence.at(eyes), evidence.at(anywhere)
     more = (at_eyes[:, None] > at_any).float().mean()
     away = float(torch.cdist(anywhere, eyes).amin(1).mean()) / size
-    distance = "not told"
-    if found is not None:
+    distance = "not sure"
+    if found is not None and found.sure:
         distance = f"{float((found[1] * torch.cdist(found[0], eyes).amin(1)).sum()) / size:.1%}"
     best = float(torch.cat([at_eyes, at_any]).max())
     cells = (name_of(run), f"{best:.2f}", distance, f"{away:.1%}", f"{more:.0%}")

@@ -50,7 +50,7 @@ def lod(
 
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
     are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
-    from poses sampled in free space.
+    from sampled poses.
 
     Args:
         scene: a file of any format, a checkpoint, or a run (its folder or config.yml).

@@ -182,7 +182,7 @@ def compact_scene(
     photos: Photos | None = None,
 ) -> Compacted:
     """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
-    result are on the device of ``dense``. By default views are sampled in free space. With ``photos``, the scene is
+    result are on the device of ``dense``. By default views are sampled. With ``photos``, the scene is
     trained on them last, if the request has a budget for it.
 
     Refinement and repair are accepted by comparing renders with those of the dense scene

@@ -61,7 +61,7 @@ def prune_scene(
     progress: Progress = silent,
     rounding: bool = True,
 ) -> Pruned:
-    """Make a scene smaller, by default with views sampled in free space. Its numbers are rounded for the size of a
+    """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of a
     compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met, SceneError if no
     Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
     if len(dense) == 0:

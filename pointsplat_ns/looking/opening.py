@@ -74,7 +74,7 @@ def opening_views(
     outside = whole_views(surface, box.up, turns, settings.opening_elevation, width, height)
     of_outside = shown(few, outside, settings.pictured_side)
     if known is None:
-        inside = _inside(surface, box, sampler.photos_in_units, width, height)
+        inside = _inside(surface, box, sampler.photos, width, height)
     else:
         inside = views_in_units(known, centre, diagonal)
     of_inside = shown(few, inside, settings.pictured_side)

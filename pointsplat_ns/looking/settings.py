@@ -16,7 +16,7 @@ class LookingSettings:
 
     Example:
         >>> from dataclasses import replace
-        >>> replace(LOOKING, photo_share=0.0).places  # everything as by default, but no views near photo places
+        >>> replace(LOOKING, candidates_per_view=16).places  # everything as by default, but more candidates
         48
     """
 
@@ -79,15 +79,11 @@ class LookingSettings:
     """Number of Gaussians that are compared by size, as a multiple of ``evidence_count``, because one size says less
     than one vector of SH."""
 
-    candidate_places: int = 2_000
+    candidate_places: int = 1_000
     """Number of candidate places."""
 
-    first_places: int = 300
-    """Number of candidate places that are compared first."""
-
-    promising_share: float = 0.8
-    """Share of the needed evidence that the best of the first places must have, for the other candidates to be
-    compared; 0 compares all."""
+    photo_share_exponent: float = 8
+    """Exponent of the evidence of a place in its share."""
 
     place_box_factor: float = 1.5
     """Size of the box of candidate places, relative to that of the compared Gaussians without outliers."""
@@ -98,16 +94,10 @@ class LookingSettings:
     to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB). ``lab/training/photo_places.py`` prints
     it."""
 
-    sh_share_exponent: float = 16
-    """Exponent of the evidence by SH in the share of a place."""
-
     min_size_evidence: float = 0.48
     """Smallest evidence of the best place by size: correlation of the logarithms of size and distance; infinity turns
     photo places off in scenes without SH. Captures from outside reach 0.50 to 0.78, rooms, where any free place will
     do, 0.23 to 0.46. ``lab/training/photo_places.py`` prints it."""
-
-    size_share_exponent: float = 8
-    """Exponent of the evidence by size in the share of a place."""
 
     # Surface points (surface.py)
 
@@ -219,7 +209,19 @@ class LookingSettings:
     opening_beside: float = 0.5
     """Views from within come after one of the whole if they show this share of the Gaussians that it shows."""
 
-    # Rooms (sampling.py)
+    # Rooms, and views from enclosed places (sampling.py, opening.py)
+
+    places: int = 48
+    """Largest number of places in a scene that are tested."""
+
+    box_draws: int = 4
+    """Number of places that are drawn from the upright box for each of ``places``, because some are not free."""
+
+    eye_heights: tuple[float, float] = (0.3, 0.75)
+    """Smallest and largest height of cameras in a room, as shares of its height; (0, 1) turns the rule off."""
+
+    min_clearance: float = 0.5
+    """Smallest distance of these places from surfaces, units; 0 turns the rule off."""
 
     min_enclosure: float = 0.6
     """Smallest share of all directions in which a place has a surface, for the place to be enclosed."""
@@ -231,105 +233,52 @@ class LookingSettings:
     """Smallest share of the points, relative to those that are visible from outside, that are visible from the enclosed
     places of a room."""
 
-    # Places and directions of candidate views (search.py)
-
-    places: int = 48
-    """Largest number of places whose views compete in one round."""
-
-    draws: int = 2
-    """Number of places that are drawn for each of ``places``, because some are not free."""
-
-    box_draws: int = 4
-    """Number of places that are drawn from the upright box for each of ``places``, because some are not free."""
-
-    turns_inside: int = 8
-    """Number of views from each enclosed place, and from each place near photo places."""
-
-    turns_outside: int = 4
-    """Number of views from each other place."""
-
-    eye_heights: tuple[float, float] = (0.3, 0.75)
-    """Smallest and largest height of cameras in a room, as shares of its height; (0, 1) turns the rule off."""
-
-    pitch_mean: float = -10.0
-    """Mean pitch of cameras in a room, and pitch of those that compete to be the first, degrees; above 0 is up."""
-
-    pitch_deviation: float = 8.0
-    """Standard deviation of the pitch, degrees."""
-
-    elevations: tuple[float, float] = (-5.0, 60.0)
-    """Smallest and largest elevation of cameras outside of the content, seen from its centre, degrees."""
-
-    distances: tuple[float, float] = (5.5, 9.5)
-    """Smallest and largest distance of cameras outside of the content from its centre, units."""
-
-    target_share: float = 0.7
-    """Cameras outside look at a point between the centre and at most this share of the way to a visible point; 0 makes
-    all look at the centre."""
-
-    # Views near photo places (search.py)
-
-    photo_share: float = 0.5
-    """Share of the views that stand near photo places, if traces show them; 0 turns the rule off."""
-
-    photo_place_deviation: float = 0.4
-    """Standard deviation of candidates from photo places along each axis, units: the distance between these."""
-
-    # Coverage gain of a view (search.py)
-
     gain_points: int = 4_096
-    """Number of points that views compete for, and largest number of those from which up is estimated."""
+    """Largest number of points that views from these places compete for, and from which up is estimated."""
 
-    half_gain_distance: float = 4.0
-    """Distance at which a point counts half, because it is small in the picture, units; infinity turns the rule off."""
-
-    half_gain_angle: float = 0.015
-    """Angle that a Gaussian's standard deviation subtends at which its points count half, radians; infinity turns the
-    rule off. Photos are taken from where most Gaussians are smaller. In compact scenes of seven captures and splats it
-    gains 0.2 dB."""
-
-    half_gain_coverage: float = 0.1
-    """Coverage at which the gain of a point has halved. A view from nearby with the point in its middle adds 1."""
-
-    # Tests of a view (search.py)
-
-    min_clearance: float = 0.5
-    """Smallest distance of a camera from surfaces, units; 0 turns the rule off."""
-
-    min_clearance_photos: float = 0.1
-    """Smallest distance of a camera near photo places from surfaces, units; 0 turns the rule off. Photos may show a
-    small part of the content from nearby."""
+    # Candidate views (candidates.py)
 
     sampled_count: int = 250_000
     """About the largest number of Gaussians in which views are looked for; of more, every second (third, ...) is."""
 
-    blur_count: int = 40_000
-    """Largest number of Gaussians in the pictures that measure blur; 5,000 are too few."""
+    candidate_gaussians: int = 10_000
+    """About the largest number of Gaussians in the pictures of candidates."""
 
-    blur_side: int = 64
-    """Longer side of the pictures that measure blur, pixels."""
+    candidate_side: int = 64
+    """Longer side of these pictures, pixels."""
 
-    max_blur: float = 0.04
-    """Largest blur of a view: median over pixels of the angle that Gaussians' standard deviations subtend, radians;
-    infinity turns the rule off. In photos of six captures it is 0.009 to 0.026."""
+    min_candidate_pixels: float = 0.02
+    """Smallest sum of blend weights over the pixels of such a picture for it to show a Gaussian, pixels."""
 
-    coarse_blur: float = 2.0
-    """The largest blur is at least this multiple of the angle that the median Gaussian subtends from half the content's
-    diagonal; 0 turns it off. Scenes of few, large Gaussians need it."""
+    candidates_per_view: int = 8
+    """Number of candidates for each view."""
 
-    blur_growth: float = 2.0
-    """Factor of the largest blur after a round that finds too few views; 1 turns it off."""
+    min_candidates: int = 64
+    """Smallest number of candidates."""
 
-    # End of the search (search.py)
+    likely_per_view: int = 3
+    """Number of likely candidates for each view, of which those are taken that complete each other."""
 
-    round_views: int = 16
-    """Largest number of views that are taken in one round, before other places are drawn."""
+    half_gain_coverage: float = 0.5
+    """Number of views that show a Gaussian at which one more counts a half."""
 
-    max_refused: int = 32
-    """Number of refused candidates in a row after which a round ends. In trained scenes three were the most."""
+    apparent_sizes: tuple[float, float] = (0.0015, 0.0175)
+    """Angles that the Gaussians around the one in the middle subtend, radians: 2 to 24 pixels of 1920."""
 
-    round_factor: int = 3
-    """The search ends after this multiple of the rounds that it needs if no view is refused."""
+    width_neighbours: int = 9
+    """Number of Gaussians along a space-filling curve that count as around one, odd."""
+
+    pitches: tuple[float, float] = (-50.0, 10.0)
+    """Lowest and highest pitch of a camera that looks at a Gaussian from any side, degrees; above 0 is up."""
+
+    pitch_mean: float = -10.0
+    """Usual pitch of photos, degrees."""
+
+    photo_place_deviation: float = 0.15
+    """Standard deviation of candidates from photo places along each axis, units."""
+
+    aims: int = 4
+    """Number of Gaussians from which a camera at a photo place chooses the one at the most usual pitch."""
 
     # Sizes of pictures (sizes.py)
 

@@ -14,10 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import curve_keys, rotation_matrices, unit_cells
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.content import UNITS, positions_in_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
-from pointsplat_ns.looking.traces import trace_factors, unit_sh
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
@@ -28,9 +27,6 @@ class Surface:
     points: Tensor  # [M, 3] float64
     normals: Tensor  # [M, 3] float64 along the shortest axis of the Gaussian, of either sign
     flatness: Tensor  # [M] float64 in [0, 1]: 1 less the ratio of the shortest axis to the next
-    widths: Tensor  # [M] float32, geometric mean of the two larger standard deviations of its Gaussian, units
-    trace_factors: Tensor  # [M] float32, see :func:`~pointsplat_ns.looking.traces.trace_factors`
-    sh: Tensor  # [M, K, 3] float32, SH coefficients of its Gaussian, degrees 1 and up, of length 1
     settings: LookingSettings = LOOKING
 
     @staticmethod
@@ -41,7 +37,7 @@ class Surface:
             scene: N Gaussians, at least one of them visible.
             centre: (3,) of its content.
             size: diagonal of its content, scene units.
-            settings: those of surface points and of trace factors.
+            settings: those of surface points.
         """
         generator = torch.Generator().manual_seed(0)
         cumulative = _chances(scene, settings).cpu().cumsum(0)
@@ -56,12 +52,7 @@ class Surface:
         offsets = offsets.clamp(-settings.max_surface_offset, settings.max_surface_offset) * stds
         points = positions_in_units(some.means, centre.cpu(), size) + (axes @ offsets[..., None])[..., 0]
         flatness = 1 - stds[:, 0] / stds[:, 1].clamp_min(1e-300)
-        along = curve_keys(unit_cells(some.means)).argsort(stable=True)
-        factors = torch.empty(count, **FLOATS)
-        factors[along] = trace_factors(some, along, settings)
-        widths = (stds[:, 1] * stds[:, 2]).sqrt().float()
-        sh = unit_sh(some.features_rest, settings)
-        return Surface(points, axes[:, :, 0], flatness, widths, factors, sh, settings)
+        return Surface(points, axes[:, :, 0], flatness, settings)
 
     def __getitem__(self, rows: Tensor | slice) -> Surface:
         """Some of the points."""
@@ -70,9 +61,6 @@ class Surface:
             points=self.points[rows],
             normals=self.normals[rows],
             flatness=self.flatness[rows],
-            widths=self.widths[rows],
-            trace_factors=self.trace_factors[rows],
-            sh=self.sh[rows],
         )
 
     def clearance(self, places: Tensor) -> Tensor:

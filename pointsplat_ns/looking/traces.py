@@ -24,7 +24,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import positions_in_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
@@ -32,14 +31,12 @@ from pointsplat_ns.system.tensors import FLOATS
 
 
 class PhotoPlaces(NamedTuple):
-    """Places where photos were taken."""
+    """Places where photos may have been taken."""
 
-    places: Tensor  # [P, 3] float64, scene units
+    places: Tensor  # [P, 3] float64, in the unit of the scene
     shares: Tensor  # [P] shares of the photos, which sum to 1
-
-    def in_units(self, centre: Tensor, size: float) -> PhotoPlaces:
-        """The places in units of the content, see :func:`~pointsplat_ns.looking.content.positions_in_units`."""
-        return PhotoPlaces(positions_in_units(self.places, centre, size), self.shares)
+    sure: bool = True
+    """Whether the best place explains enough for photos to have been taken there."""
 
 
 def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
@@ -132,34 +129,21 @@ class PhotoEvidence:
         return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
 
 
-def photo_places(scene: Gaussians, settings: LookingSettings = LOOKING) -> PhotoPlaces | None:
+def photo_places(evidence: PhotoEvidence, generator: torch.Generator) -> PhotoPlaces | None:
     """Where the photos of a scene were taken, estimated from its Gaussians.
 
-    Args:
-        scene: N Gaussians.
-        settings: those of photo places.
-
     Returns:
-        The places and their shares; None without enough evidence. Deterministic.
+        The places and their shares, in the unit of the evidence; None if no Gaussian is compared.
     """
-    generator = torch.Generator().manual_seed(0)
-    evidence = PhotoEvidence.of(scene, generator, settings)
     if len(evidence.means) == 0:
         return None
-    needed, exponent = settings.min_sh_evidence, settings.sh_share_exponent
-    if not evidence.has_sh:
-        needed, exponent = settings.min_size_evidence, settings.size_share_exponent
+    settings = evidence.settings
     places = evidence.candidates(settings.candidate_places, generator)
-    found = evidence.at(places[: settings.first_places])
-    if not float(found.max()) >= settings.promising_share * needed:
-        return None
-    if len(places) > settings.first_places:
-        found = torch.cat([found, evidence.at(places[settings.first_places :])])
+    found = evidence.at(places)
     best = float(found.max())
-    if best < needed:
-        return None
-    shares = (found.clamp_min(0) / best) ** exponent
-    return PhotoPlaces(places, shares / shares.sum())
+    shares = (found.clamp_min(0) / max(best, 1e-9)) ** settings.photo_share_exponent + 1e-12
+    needed = settings.min_sh_evidence if evidence.has_sh else settings.min_size_evidence
+    return PhotoPlaces(places, shares / shares.sum(), sure=best >= needed)
 
 
 def unit_sh(sh: Tensor, settings: LookingSettings = LOOKING) -> Tensor:

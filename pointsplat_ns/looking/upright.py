@@ -195,7 +195,8 @@ def levelness(axes: Tensor, photos: PhotoPlaces) -> Tensor:
     Returns:
         (D,) float64 in [0, 1]; 0 if all places are one.
     """
-    places, shares = photos.places.double(), photos.shares.double()
+    places, shares = photos.places.double(), photos.shares.double().square()  # the likeliest places alone
+    shares = shares / shares.sum()
     offsets = places - shares @ places
     spread = offsets.T @ (shares[:, None] * offsets)
     widest = torch.linalg.eigvalsh(spread)[-1]

@@ -1,4 +1,4 @@
-"""The source of a scene's views: given views, the poses of its dataset, or poses sampled in free space."""
+"""The source of a scene's views: given views, the poses of its dataset, or sampled poses."""
 
 from __future__ import annotations
 
@@ -117,8 +117,7 @@ class ViewSource:
             self.origin = "poses of the dataset"
             return self._at_resolution(self._of_dataset.spread(count))
         views = self.sampler.views(count)
-        near = "" if self.sampler.photos is None else ", half of them where photos were taken"
-        self.origin = f"poses sampled in free space{near}, up is {self.up}{self.missing}"
+        self.origin = f"sampled poses, up is {self.up}{self.missing}"
         return views
 
     @cached_property

@@ -72,7 +72,7 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     lines = said.splitlines()
     found = re.match(r"refined by the network: ([\d.]+) -> ([\d.]+) dB PSNR .* \(12 views", lines[1])
     assert float(found[2]) > float(found[1])
-    assert lines[0].startswith("views: poses sampled in free space, up is ") and "small.ply: " in lines[2]
+    assert lines[0].startswith("views: sampled poses, up is ") and "small.ply: " in lines[2]
     assert "shown.png: dense, pruned, refined, side by side" in said
     height, width, _ = matplotlib.image.imread(tmp_path / "shown.png").shape
     assert width == 1600 and height > 1200  # three columns and rows of 4 to 3, and a line of titles

@@ -92,7 +92,7 @@ def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):
     sheet = tmp_path / "sheet.png"
     run("info", scene, "--views", sheet, "--resolution", "64x48")
     said = capsys.readouterr().out
-    assert "of 64 x 48 pixels; poses sampled in free space" in said and "up is " in said
+    assert "of 64 x 48 pixels; sampled poses" in said and "up is " in said
     assert "of the visible content" in said and sheet.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit):
         run("info", scene, "--views", sheet)

@@ -185,7 +185,7 @@ def test_one_gaussian_is_compacted_and_none_are_refused(scene, short_search):
         result = compacted(one, trained(tiny_refiner("scales", moved), 1), None)
         assert len(result.scene) == 1 and same(result.scene, one) and not result.accepted
         [note] = result.notes
-        assert note.startswith("views: poses sampled in free space, up is ") and result.before.psnr == math.inf
+        assert note.startswith("views: sampled poses, up is ") and result.before.psnr == math.inf
     faint = one.replace(opacities=torch.tensor([[-4.0]]))
     result = compacted(faint, trained(tiny_refiner("scales", 0.3), 1), None)
     assert same(result.scene, faint) and not result.accepted

@@ -94,7 +94,7 @@ def measured_room(
     return Tradeoff(
         scene="example room",
         machine="a test machine, 1 thread",
-        views_origin="poses sampled in free space",
+        views_origin="sampled poses",
         width=views.width,
         height=views.height,
         points=tuple(points),

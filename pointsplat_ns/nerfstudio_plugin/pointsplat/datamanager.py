@@ -39,7 +39,7 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     A run whose photos are not found is left out, and named."""
     supervision: Supervision = "auto"
     """Training targets for renders of the refined scene. photos: the photos of trained runs. dense: renders of the
-    dense scene from the dataset's poses, or without a dataset from poses sampled in free space. auto: photos for
+    dense scene from the dataset's poses, or without a dataset from sampled poses. auto: photos for
     trained runs, dense for PLY files."""
     sampled_poses: int = 40
     """Number of training poses sampled in a scene without a dataset. A fifth of this number is held out in addition."""

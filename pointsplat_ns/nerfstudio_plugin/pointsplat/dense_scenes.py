@@ -1,6 +1,6 @@
 """Dense scenes whose own renders take the place of photos.
 
-They are rendered from the poses of the scene's dataset, or without a dataset from poses sampled in free space. A folder
+They are rendered from the poses of the scene's dataset, or without a dataset from sampled poses. A folder
 of PLY files can thus be a training set.
 """
 

@@ -86,14 +86,12 @@ def sampled_viewpoints(sampler: Sampler, settings: MergeSettings) -> Viewpoints 
 
     Args:
         sampler: of the scene.
-        settings: ``sampled_views``, ``view_seed`` and ``find_photo_places``.
+        settings: ``sampled_views`` and ``view_seed``.
 
     Returns:
         The viewpoints; None if no place in the scene is free, or no view is asked for.
     """
-    about = settings.find_photo_places
     try:
-        views = sampler.views(settings.sampled_views, settings.view_seed, sharp=False, about_photos=about)
+        return Viewpoints(sampler.views(settings.sampled_views, settings.view_seed), sampler.photos is not None)
     except DataError:
         return None
-    return Viewpoints(views, photos_found=about and sampler.photos is not None)

@@ -124,10 +124,10 @@ def test_without_a_free_place_there_are_no_viewpoints():
     assert sampled_viewpoints(Sampler(fog, (32, 24)), MERGING) is None
 
 
-def test_photo_places_are_found_unless_that_is_turned_off():
-    sampler, settings = Sampler(photographed(), (32, 24)), replace(MERGING, sampled_views=2)
-    assert sampled_viewpoints(sampler, settings).photos_found
-    assert not sampled_viewpoints(sampler, replace(settings, find_photo_places=False)).photos_found
+def test_sampled_viewpoints_say_whether_photo_places_are_sure():
+    settings = replace(MERGING, sampled_views=2)
+    for scene, found in ((photographed(), True), (ball(500, 0), False)):
+        assert sampled_viewpoints(Sampler(scene, (32, 24)), settings).photos_found == found
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,179 @@
+"""Candidate views of a scene, and how likely it is that people took each. All is in units of the content.
+
+Training spends Gaussians on what photos show, makes them as small as photos show them, and leaves nothing to see where
+no photo looked. So a view is likely if its picture is full and shows many Gaussians, all of them small. SH tell more:
+they explain best the places that photos were taken from (:mod:`~pointsplat_ns.looking.traces`). The logarithm of the
+likelihood, up to a constant, is
+
+    log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence
+
+with the share of the Gaussians that are shown, the share of the picture that is empty, the geometric mean over the
+picture of the angle that a Gaussian subtends, radians, and the evidence of SH for its place. The numbers are rounded
+from a logistic regression between the poses of six captures and candidates: of a pose of a seventh and a candidate, the
+pose is the more likely one in 9 cases of 10. ``docs/concepts/sampled_views.md`` says more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
+from pointsplat_ns.looking.content import UNITS, thinned
+from pointsplat_ns.looking.each_view import each_view
+from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.looking.settings import LookingSettings
+from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths, means_around
+from pointsplat_ns.looking.upright import level_directions
+from pointsplat_ns.rasterizer import pixels_of
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+
+MIN_EMPTY = 0.01
+"""Share of a picture up to which it counts as full."""
+
+BLUR_EXPONENT = 2.0
+EVIDENCE_WEIGHT = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What candidate views are drawn from and judged by."""
+
+    few: Gaussians
+    """Some of the Gaussians, enlarged to cover as much as all."""
+    targets: Tensor
+    """Indices (t,) of those that are opaque enough to be looked at."""
+    widths: Tensor
+    """Logarithms (n,) of their widths before they were enlarged, float32."""
+    widths_around: Tensor
+    """Means (n,) of these over neighbours."""
+    evidence: PhotoEvidence
+    places: PhotoPlaces | None
+    """Places that photos may have been taken from; None if nothing of the scene tells."""
+    up: Tensor
+    """(3,) of length 1."""
+    resolution: tuple[int, int]
+    """Width and height of the pictures, pixels."""
+    settings: LookingSettings
+
+    @staticmethod
+    def of(
+        scene: Gaussians,
+        step: int,
+        evidence: PhotoEvidence,
+        places: PhotoPlaces | None,
+        up: Tensor,
+        resolution: tuple[int, int],
+        settings: LookingSettings,
+    ) -> Candidates:
+        """Candidates of a scene.
+
+        Args:
+            scene: N Gaussians on the CPU.
+            step: the scene is every so many-th Gaussian of another, enlarged to cover as much as all.
+            evidence, places: of this scene.
+            up: (3,) of length 1.
+            resolution: width and height, pixels.
+            settings: those of candidate views.
+        """
+        scene = scene[scene.usable()]
+        few = thinned(scene, settings.candidate_gaussians)
+        along = curve_keys(unit_cells(few.means)).argsort(stable=True)
+        few = few[along]
+        enlarged = 0.5 * math.log(step * max(1, len(scene) // settings.candidate_gaussians))
+        widths = log_widths(few.scales) - enlarged
+        alphas = few.alphas
+        targets = (alphas > min(settings.min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
+        around = means_around(widths, settings.width_neighbours)
+        return Candidates(few, targets, widths.exp().float(), around, evidence, places, up, resolution, settings)
+
+    def views(self, count: int, generator: torch.Generator) -> Tensor:
+        """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other."""
+        settings = self.settings
+        drawn = self._drawn(max(settings.min_candidates, settings.candidates_per_view * count), generator)
+        likelihoods, shown = self.judged(drawn)
+        likely = (likelihoods - likelihoods.max()).exp().float()
+        shown = shown[:, self.targets].float()
+        coverage = torch.zeros(shown.shape[1], **FLOATS)
+        taken: list[int] = []
+        for _ in range(count):
+            gains = likely * (shown @ (1 / (settings.half_gain_coverage + coverage)))
+            gains[taken] = -1.0
+            taken.append(int(gains.argmax()))
+            coverage += shown[taken[-1]]
+        return drawn[taken]
+
+    @cached_property
+    def _floor(self) -> float:
+        """Height below which no camera stands, units."""
+        heights = self.few.means[self.targets].double() @ self.up
+        return float(heights.quantile(self.settings.content_quantiles[0]))
+
+    def _drawn(self, count: int, generator: torch.Generator) -> Tensor:
+        """Candidates (V, 4, 4): half of them at random distances from Gaussians, half from likely photo places."""
+        if self.places is None:
+            return self._at_gaussians(count, generator)
+        half = count // 2
+        return torch.cat([self._at_gaussians(count - half, generator), self._from_places(half, generator)])
+
+    def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
+        """Cameras (count, 4, 4) that look at Gaussians, from where their neighbourhood is as small as in photos, or, if
+        that is too far away, from any distance."""
+        settings, aim = self.settings, self._targets(count, generator)
+        angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
+        small, large = settings.apparent_sizes
+        distance = self.widths_around[aim].exp() / (small * (large / small) ** angle)
+        distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
+        low, high = settings.pitches
+        pitch = torch.deg2rad(low + (high - low) * pitch)
+        ahead = pitch.cos()[:, None] * level_directions(self.up, 2 * math.pi * turn) + pitch.sin()[:, None] * self.up
+        target = self.few.means[aim].double()
+        below = ((target - distance[:, None] * ahead) @ self.up < self._floor).to(ahead.dtype)
+        ahead = ahead - (2 * below * (ahead @ self.up))[:, None] * self.up  # from above instead
+        return look_at(target - distance[:, None] * ahead, target, self.up)
+
+    def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
+        """Cameras (count, 4, 4) near photo places, which are drawn by their shares. Each looks at one of a few
+        Gaussians, the one at the most usual pitch."""
+        assert self.places is not None
+        settings = self.settings
+        drawn = torch.multinomial(self.places.shares.float(), count, replacement=True, generator=generator)
+        offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
+        eyes = self.places.places[drawn] + settings.photo_place_deviation * offsets
+        eyes = eyes + (self._floor - eyes @ self.up).clamp_min(0)[:, None] * self.up
+        aim = self._targets(count * settings.aims, generator).view(count, settings.aims)
+        targets = self.few.means[aim].double()
+        ahead = targets - eyes[:, None]
+        rise = (ahead @ self.up) / ahead.norm(dim=2).clamp_min(1e-9)
+        pitch = torch.rad2deg(torch.asin(rise.clamp(-1, 1)))
+        usual = (pitch - settings.pitch_mean).abs().argmin(1)
+        return look_at(eyes, targets[torch.arange(count, device="cpu"), usual], self.up)
+
+    def _targets(self, count: int, generator: torch.Generator) -> Tensor:
+        """Indices (count,) of Gaussians to look at, each as likely as any other."""
+        return self.targets[torch.randint(len(self.targets), (count,), generator=generator, device="cpu")]
+
+    def judged(self, viewmats: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithms (V,) of the likelihood of views (V, 4, 4), up to a constant, float64, and which of the Gaussians
+        each shows (V, n), bool."""
+        settings = self.settings
+        views = views_of(viewmats, *self.resolution, UNITS, settings).resized(settings.candidate_side)
+        views = replace(views, rasterize_mode="antialiased")
+        eyes = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+        likelihoods, shown = [], []
+        for eye, pixels in zip(eyes, each_view(self.few, views, pixels_of), strict=True):
+            covered = float(pixels.double().sum())
+            distances = (self.few.means - eye.float()).norm(dim=1).clamp_min(1e-3)
+            blur = float((pixels * self.widths / distances).double().sum()) / max(covered, 1e-9)
+            blur = max(blur, 1e-9)
+            shown.append(pixels > settings.min_candidate_pixels)
+            share = (float(shown[-1].sum()) + 1) / len(pixels)
+            empty = max(0.0, 1 - covered / (views.width * views.height))
+            likelihoods.append(math.log(share) - math.log(empty + MIN_EMPTY) - BLUR_EXPONENT * math.log(blur))
+        evidence = self.evidence.at(eyes).double() if self.evidence.has_sh else torch.zeros(len(eyes), **DOUBLES)
+        return torch.tensor(likelihoods, **DOUBLES) + EVIDENCE_WEIGHT * evidence, torch.stack(shown)
