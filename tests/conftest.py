@@ -15,7 +15,6 @@ from nerfstudio.configs import external_methods
 from making import SHARED_DATA
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -236,9 +235,3 @@ def hollow_ball(make_hollow_ball) -> Gaussians:
 def ball_views(hollow_ball: Gaussians) -> Views:
     """Four small views from within."""
     return sample_views(hollow_ball, 4, 64, 48)
-
-
-@pytest.fixture()
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for views ends after one round without a view, not after four: each round takes seconds."""
-    monkeypatch.setitem(vars(LOOKING), "max_fruitless_rounds", 1)

@@ -201,15 +201,13 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 """Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
 
-SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Four rules exist
+SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Three rules exist
 because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
-(rock, taebak), merging holds before a white background (ethiopianHead), repairs take no views that large Gaussians
-fill, and views look from enclosed places of what is no room as a whole (both apt_kitchen_balcony).
-[benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
+(rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show little blur
+(apt_kitchen_balcony). [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
 The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}.
-Rows of captures are older than those of splats: merging sampled 48 views then, 24 now, and a
-repair saw pictures of one size. All rows of `compact` are of repairs of 48 steps; 192 in pictures of 320 pixels
-gain 0.2 to 1.1 dB on seven splats at 10 %, in 1.2 to 1.5 times the CPU seconds."""
+Rows of captures and of taebak are older than those of other splats: of other sampled views, and of repairs of 48
+steps."""
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 

@@ -21,9 +21,8 @@ BASELINE = "default"
 MERGING = {
     "no_renders": dict(min_count_rendered=10**9),
     "reference_20k": dict(max_count_rendered=20_000),
-    "sampled_views_48": dict(sampled_views=48),
+    "sampled_views_24": dict(sampled_views=24),
     "other_views": dict(view_seed=2),
-    "no_photo_places": dict(find_photo_places=False),
     "visibility_views_16": dict(visibility_views=16),
     "visibility_side_56": dict(visibility_side=56),
     "visibility_side_224": dict(visibility_side=224),
@@ -68,33 +67,24 @@ LOOKING = {
     "no_flatness_without_sh": dict(flatness_exponent_without_sh=0.0),
     "no_trace_factors": dict(max_log_factor=0.0),
     "evidence_count_500": dict(evidence_count=500),
-    "first_places_all": dict(promising_share=0.0),
     "no_sh_evidence": dict(min_sh_evidence=1e9),
-    "sh_share_exponent_4": dict(sh_share_exponent=4.0),
     "no_size_evidence": dict(min_size_evidence=1e9),
-    "size_share_exponent_2": dict(size_share_exponent=2.0),
     "no_min_opacity": dict(min_opacity=0.0),
     "surface_exponent_0": dict(surface_exponent=0.0),
     "surface_exponent_1": dict(surface_exponent=1.0),
     "no_usual_axes": dict(usual_axis_factors=(0.0, 0.0)),
     "no_photo_level": dict(photo_level_weight=0.0),
     "no_seen_from_above": dict(min_seen_from_above=float("inf")),
-    "never_a_room": dict(min_enclosed_places=2.0),
-    "places_24": dict(places=24),
-    "any_eye_height": dict(eye_heights=(0.0, 1.0)),
-    "level_views": dict(pitch_mean=0.0, pitch_deviation=0.0),
-    "target_centre": dict(target_share=0.0),
-    "no_photo_views": dict(photo_share=0.0),
-    "photo_views_only": dict(photo_share=1.0),
-    "photo_place_deviation_0.2": dict(photo_place_deviation=0.2),
-    "no_half_gain_distance": dict(half_gain_distance=1e9),
-    "no_half_gain_angle": dict(half_gain_angle=1e9),
+    "places_evenly": dict(photo_share_exponent=0.0),
+    "photo_place_deviation_0.4": dict(photo_place_deviation=0.4),
+    "candidates_4": dict(candidates_per_view=4),
+    "candidates_16": dict(candidates_per_view=16),
+    "candidate_gaussians_4k": dict(candidate_gaussians=4_000),
+    "any_pitch": dict(pitches=(-90.0, 90.0), aims=1),
     "half_gain_coverage_1": dict(half_gain_coverage=1.0),
-    "no_clearance": dict(min_clearance=0.0, min_clearance_photos=0.0),
     "smallest_side_160": dict(smallest_side=160),
 }
-"""Variants of :class:`~pointsplat_ns.looking.settings.LookingSettings`, which are in force while ``merge`` runs.
-Merging does not test views for blur, so there are no variants of blur."""
+"""Variants of :class:`~pointsplat_ns.looking.settings.LookingSettings`, which are in force while ``merge`` runs."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ def compact(
     Neighbours are merged; with --refiner a network refines the result in one pass; then learned steps repair it: they
     bring it closer to renders of the dense scene. Each change is compared in other views, and left out if it harms
     pictures of any size. Views are those of --poses, else those of the run's dataset; if there are none, they are
-    sampled in free space.
+    sampled.
 
     A folder with config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians below
     it, and the newest Splatfacto run of each experiment. Finished scenes are skipped, so the same command continues

@@ -87,7 +87,7 @@ def print_result(
     place = "dry run, nothing is written" if where is None else where
     counts = f"{len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
     print(f"{place}: {done} to {counts}, {size}, in {seconds_text(seconds)}")
-    print(quality or "not compared with the dense scene: there is no free place to look from")
+    print(quality or "not compared with the dense scene: nothing of it is visible")
 
 
 def written_size(where: Path) -> str:

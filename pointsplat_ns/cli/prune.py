@@ -62,7 +62,7 @@ def prune(
     photos are needed.
 
     If anything has to be rendered, cameras are those of --poses, else those of the run's dataset; if there are none,
-    they are sampled in free space.
+    they are sampled.
 
     Args:
         scene: a file of any format, a checkpoint, a run (its folder or config.yml), or a folder of scenes.

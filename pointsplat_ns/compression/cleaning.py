@@ -1,7 +1,7 @@
 """Finds the Gaussians of a scene that no picture needs, so that a budget is spent on the others.
 
 Two rules remove a Gaussian. The first: it cannot be drawn, because a value is NaN or infinite, or because it is fainter
-than the rasterizer draws. The second: no camera sees it. Cameras stand at places in free space and look in all
+than the rasterizer draws. The second: no camera sees it. Cameras stand where sampled views do and look in all
 directions; a Gaussian is unseen if it has no blend weight (its opacity at a pixel times the transmittance in front of
 it) on any pixel of any image. So a visible background stays, and so does a lamp that hangs in the air.
 """
@@ -54,7 +54,7 @@ class Junk:
     undrawable: Tensor  # [A] int64, unusable Gaussians first, then by rising opacity
     unseen: Tensor  # [B] int64, by rising opacity
     places: int
-    """Number of places of cameras; 0 if there is no free space, and no Gaussian is unseen then."""
+    """Number of places of cameras; 0 if nothing is visible, and no Gaussian is unseen then."""
 
     def __len__(self) -> int:
         return len(self.undrawable) + len(self.unseen)
@@ -120,7 +120,7 @@ def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Pr
         return Cleaning(junk, len(dense), (f"clean: nothing removed{why}",))
     progress("comparing renders without junk", 0.0)
     reference = _reference(dense, views)
-    places = f"looking around from {junk.places} places" if junk.places else "no free place to look from was found"
+    places = f"looking around from {junk.places} places" if junk.places else "nothing to look from was found"
     rules = (
         (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
         (
@@ -169,8 +169,8 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
 
 
 def _views_all_around(scene: Gaussians) -> Views:
-    """Views in six directions from places in free space, six in a row for each place. Raises DataError if there is
-    none."""
+    """Views in six directions from the places of sampled views, six in a row for each place. Raises DataError if
+    nothing is visible."""
     # Without SH, so that places do not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
     places = invert_rigid(sample_views(without_sh, CLEANING.places, seed=CLEANING.seed).viewmats)[:, :3, 3]

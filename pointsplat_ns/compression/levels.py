@@ -272,8 +272,8 @@ def make_levels(
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
         levels: see :func:`parse_levels`; in any order.
         sh: SH bands of every level, as for :class:`~pointsplat_ns.compression.requests.PruneRequest`.
-        views: source of the views to compare renders in; merging uses them too where they are known. By default poses
-            sampled in free space.
+        views: source of the views to compare renders in; merging uses them too where they are known. By default views
+            are sampled.
         source: the file of ``dense``, for the manifest.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 

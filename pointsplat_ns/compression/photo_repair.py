@@ -125,7 +125,7 @@ def photo_repair(
         The best scene so far at Ctrl-C.
 
     Raises:
-        DataError: if there are fewer than two photos, or no place for a camera.
+        DataError: if there are fewer than two photos, or nothing of the scene is visible.
     """
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")

@@ -60,7 +60,7 @@ def repair(
             ``REPAIR.nearly_right`` the steps are smaller.
 
     Raises:
-        DataError: if there is no free space for a camera.
+        DataError: if nothing of the scene is visible.
     """
     run = OptimisationRun(budget)
     if network == "shipped":

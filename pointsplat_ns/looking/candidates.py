@@ -7,8 +7,8 @@ likelihood, up to a constant, is
 
     log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence
 
-with the share of the Gaussians that are shown, the share of the picture that is empty, the geometric mean over the
-picture of the angle that a Gaussian subtends, radians, and the evidence of SH for its place. The numbers are rounded
+with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture
+of the angle that a Gaussian subtends, radians, and the evidence of SH for its place. The numbers are rounded
 from a logistic regression between the poses of six captures and candidates: of a pose of a seventh and a candidate, the
 pose is the more likely one in 9 cases of 10. ``docs/concepts/sampled_views.md`` says more.
 """
@@ -32,9 +32,13 @@ from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths,
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+from pointsplat_ns.views import Views
 
 MIN_EMPTY = 0.01
 """Share of a picture up to which it counts as full."""
+
+MIN_BLUR = 1e-9
+"""Blur of Gaussians that are points, radians."""
 
 BLUR_EXPONENT = 2.0
 EVIDENCE_WEIGHT = 0.75
@@ -96,17 +100,22 @@ class Candidates:
         """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other."""
         settings = self.settings
         drawn = self._drawn(max(settings.min_candidates, settings.candidates_per_view * count), generator)
-        likelihoods, shown = self.judged(drawn)
+        likelihoods, shown = self.judged(views_of(drawn, *self.resolution, UNITS, settings))
+        return drawn[self.completing(likelihoods, shown, count)]
+
+    def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
+        """Indices of at most ``count`` views, as :meth:`judged`. The next one always has the largest product of its
+        likelihood and of what it adds to those before."""
         likely = (likelihoods - likelihoods.max()).exp().float()
         shown = shown[:, self.targets].float()
         coverage = torch.zeros(shown.shape[1], **FLOATS)
         taken: list[int] = []
-        for _ in range(count):
-            gains = likely * (shown @ (1 / (settings.half_gain_coverage + coverage)))
+        for _ in range(min(count, len(likely))):
+            gains = likely * (shown @ (1 / (self.settings.half_gain_coverage + coverage)))
             gains[taken] = -1.0
             taken.append(int(gains.argmax()))
             coverage += shown[taken[-1]]
-        return drawn[taken]
+        return taken
 
     @cached_property
     def _floor(self) -> float:
@@ -158,19 +167,19 @@ class Candidates:
         """Indices (count,) of Gaussians to look at, each as likely as any other."""
         return self.targets[torch.randint(len(self.targets), (count,), generator=generator, device="cpu")]
 
-    def judged(self, viewmats: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithms (V,) of the likelihood of views (V, 4, 4), up to a constant, float64, and which of the Gaussians
-        each shows (V, n), bool."""
-        settings = self.settings
-        views = views_of(viewmats, *self.resolution, UNITS, settings).resized(settings.candidate_side)
-        views = replace(views, rasterize_mode="antialiased")
+    def judged(self, views: Views) -> tuple[Tensor, Tensor]:
+        """Logarithms (V,) of the likelihood of views in units of the content, up to a constant, float64, and which of
+        the Gaussians each shows (V, n), bool."""
+        settings, viewmats = self.settings, views.viewmats.double()
+        views = replace(views.resized(settings.candidate_side), rasterize_mode="antialiased")
         eyes = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
         likelihoods, shown = [], []
         for eye, pixels in zip(eyes, each_view(self.few, views, pixels_of), strict=True):
             covered = float(pixels.double().sum())
             distances = (self.few.means - eye.float()).norm(dim=1).clamp_min(1e-3)
-            blur = float((pixels * self.widths / distances).double().sum()) / max(covered, 1e-9)
-            blur = max(blur, 1e-9)
+            blur = 1.0  # radian, of a view that shows nothing
+            if covered > 0:
+                blur = max(float((pixels * self.widths / distances).double().sum()) / covered, MIN_BLUR)
             shown.append(pixels > settings.min_candidate_pixels)
             share = (float(shown[-1].sum()) + 1) / len(pixels)
             empty = max(0.0, 1 - covered / (views.width * views.height))

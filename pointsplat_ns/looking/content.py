@@ -86,6 +86,14 @@ def views_in_units(views: Views, centre: Tensor, size: float) -> Views:
     return dataclasses.replace(views, viewmats=viewmats, Ks=Ks, background=background, near_plane=near_plane)
 
 
+def in_scene_units(views: Views, centre: Tensor, size: float) -> Views:
+    """Views in units of the content, changed into views of the scene: the opposite of :func:`views_in_units`."""
+    viewmats = views.viewmats.clone()
+    viewmats[:, :3, 3] *= size / UNITS
+    viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ centre
+    return dataclasses.replace(views, viewmats=viewmats, near_plane=views.near_plane * size / UNITS)
+
+
 def thinned(scene: Gaussians, max_count: int) -> Gaussians:
     """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
     step = max(1, len(scene) // max_count)

@@ -54,7 +54,7 @@ def coverage(
     try:
         visible |= views_that_show(sample_views(scene, samples, seed=96, settings=settings)) > 0
     except DataError:
-        pass  # no place in the scene is free
+        pass  # nothing is visible
     stds = scene.stds.double().nan_to_num(0.0, 0.0, 0.0).sort(dim=1).values
     mass = torch.where(visible, scene.alphas.double().nan_to_num(0.0) * stds[:, 1] * stds[:, 2], 0.0)
     if bool(visible.any()):

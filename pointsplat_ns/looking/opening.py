@@ -1,27 +1,24 @@
-"""The views in which people see a scene first: its subject whole and upright, or most of a room.
+"""The views in which people see a scene first: its subject whole and upright, or from where people stood.
 
-Views that decide stand near the content and complete each other; each of them may cut off a head. A person who opens a
-scene wants one picture that shows what it is, and then others.
+A person who opens a scene wants one picture that shows what it is, and then others. An object is shown whole: people
+are as likely to take a picture of all of it (:mod:`~pointsplat_ns.looking.candidates`) as others. In a room or
+outdoors, where nobody stands outside of everything, they are not.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, views_in_units
-from pointsplat_ns.looking.poses import in_pictures, look_at, views_of
-from pointsplat_ns.looking.sampling import Sampler, views_in_scene_units
+from pointsplat_ns.looking.content import UNITS, in_scene_units, views_in_units
+from pointsplat_ns.looking.poses import views_of
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
-from pointsplat_ns.looking.surface import Surface
-from pointsplat_ns.looking.traces import PhotoPlaces
-from pointsplat_ns.looking.upright import Up, UprightBox, level_directions
-from pointsplat_ns.looking.whole import around, few_in_units, shown, whole_views
-from pointsplat_ns.system.tensors import FLAGS, INDICES
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.whole import around, whole_views
 from pointsplat_ns.views import Views
 
 
@@ -48,9 +45,9 @@ def opening_views(
 ) -> Opening:
     """The views in which to show a scene first.
 
-    Cameras around the scene, which show all of it, compete with known views, or with views from enclosed places in it.
-    The best view shows the most Gaussians. Views from outside come first unless the scene is a room, or one of the
-    others shows clearly more.
+    If a view from around the scene, which shows all of it, is at least as likely as half of the known views, or of
+    sampled ones, it comes first, and others of its kind or known ones follow. Else known or sampled views come, the
+    likeliest first. Views complete each other.
 
     Args:
         scene: N Gaussians.
@@ -65,74 +62,28 @@ def opening_views(
         DataError: if nothing of the scene is visible.
     """
     sampler = Sampler(scene, (width, height), up, settings)
-    centre, diagonal = sampler.content
-    surface, box = sampler.surface, sampler.box
-    if known is not None:
-        width, height = known.width, known.height
-    few = few_in_units(scene, settings.pictured_count, centre, diagonal)
-    turns = around(settings.opening_turns)
-    outside = whole_views(surface, box.up, turns, settings.opening_elevation, width, height)
-    of_outside = shown(few, outside, settings.pictured_side)
+    content, candidates = sampler.content, sampler.candidates
     if known is None:
-        inside = _inside(surface, box, sampler.photos, width, height)
+        generator = torch.Generator().manual_seed(0)
+        others = views_of(candidates.views(settings.opening_candidates, generator), width, height, UNITS, settings)
     else:
-        inside = views_in_units(known, centre, diagonal)
-    of_inside = shown(few, inside, settings.pictured_side)
-    most_outside, most_inside = (int(rows.sum(1).max()) if len(rows) else 0 for rows in (of_outside, of_inside))
-    ratio = most_inside / max(most_outside, 1)
-    whole = most_inside == 0 or not (sampler.inside or ratio > settings.opening_inside)
-    if not whole:
-        taken = _completing(of_inside, count)
-        if known is not None:
-            return Opening(known[taken], sampler.up, False)
-        chosen = inside[taken].viewmats
-    elif known is not None or ratio > settings.opening_beside:
-        first = int(of_outside.sum(1).argmax())
-        others = _completing(of_inside & ~of_outside[first], count - 1)
-        chosen = torch.cat([outside[[first]].viewmats, inside[others].viewmats])
-    else:
-        sides = turns[of_outside.sum(1).argmax()] + around(count)
-        chosen = whole_views(surface, box.up, sides, settings.opening_elevation, width, height).viewmats
-    views = views_in_scene_units(chosen, width, height, centre, diagonal, settings)
-    if known is not None:
-        Ks = torch.cat([views.Ks[:1], known.Ks[others].to(views.Ks)])
-        viewmats = torch.cat([views.viewmats[:1], known.viewmats[others].to(views.viewmats)])
-        views = replace(known, viewmats=viewmats, Ks=Ks)
-    return Opening(views, sampler.up, whole)
+        others, width, height = views_in_units(known, *content), known.width, known.height
 
+    def outside(turns: Tensor) -> Views:
+        return whole_views(sampler.surface, sampler.up.direction, turns, settings.opening_elevation, width, height)
 
-def _inside(surface: Surface, box: UprightBox, photos: PhotoPlaces | None, width: int, height: int) -> Views:
-    """Views from enclosed places and from photo places, of all those that show most of the surface."""
-    settings, up = surface.settings, box.up
-    generator = torch.Generator().manual_seed(0)
-    places = box.places_at_eyes(generator, settings)
-    if photos is not None:
-        best = photos.shares.topk(min(settings.places // 3, len(photos.shares))).indices
-        places = torch.cat([photos.places[best], places])
-    places = places[surface.clearance(places) > settings.min_clearance][: settings.places]
-    visible, enclosure = surface.visible_from(places)
-    places, visible = places[enclosure >= settings.min_enclosure], visible[enclosure >= settings.min_enclosure]
-    count = settings.opening_turns
-    turn = around(count).repeat(len(places))
-    pitch = math.radians(settings.pitch_mean)
-    eyes = places.repeat_interleave(count, dim=0)
-    targets = eyes + math.cos(pitch) * level_directions(up, turn.to(up)) + math.sin(pitch) * up
-    views = views_of(look_at(eyes, targets, up), width, height, UNITS, settings)
-    some = settings.gain_points
-    pictured = in_pictures(views, surface.points[:some])
-    counts = (pictured & visible[:, :some].repeat_interleave(count, dim=0)).sum(1).view(-1, count)
-    best = counts.argmax(1) + count * torch.arange(len(counts), **INDICES)  # one view a place
-    return views[best[counts.amax(1).topk(min(settings.opening_candidates, len(best))).indices]]
-
-
-def _completing(inside: Tensor, count: int) -> list[int]:
-    """Indices of views, at most ``count``: first the one that shows the most Gaussians (C, N), then always the one that
-    shows most of those that the others do not show."""
-    taken: list[int] = []
-    missing = torch.ones(inside.shape[1], **FLAGS)
-    while len(taken) < min(count, len(inside)):
-        new = (inside & missing).sum(1)
-        new[taken] = -1
-        taken.append(int(new.argmax()))
-        missing &= ~inside[taken[-1]]
-    return taken
+    turns = around(settings.opening_turns)
+    whole_likelihoods, whole_shown = candidates.judged(outside(turns))
+    likelihoods, shown = candidates.judged(others)
+    best = int(whole_likelihoods.argmax())
+    if float(whole_likelihoods[best]) < float(likelihoods.median()):
+        taken = candidates.completing(likelihoods, shown, count)
+        views = in_scene_units(others, *content)[taken] if known is None else known[taken]
+        return Opening(views, sampler.up, False)
+    if known is None:
+        return Opening(in_scene_units(outside(turns[best] + around(count)), *content), sampler.up, True)
+    taken = candidates.completing(likelihoods, shown & ~whole_shown[best], count - 1)
+    first = in_scene_units(outside(turns[best : best + 1]), *content)
+    viewmats = torch.cat([first.viewmats, known.viewmats[taken].to(first.viewmats)])
+    Ks = torch.cat([first.Ks, known.Ks[taken].to(first.Ks)])
+    return Opening(replace(known, viewmats=viewmats, Ks=Ks), sampler.up, True)

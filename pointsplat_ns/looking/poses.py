@@ -56,17 +56,3 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, setting
     )
     Ks = K.repeat(len(viewmats), 1, 1)
     return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=settings.near_plane * diagonal)
-
-
-def in_pictures(views: Views, points: Tensor, min_depth: float = 0.0) -> Tensor:
-    """Which points are in the pictures of views, (C, N) bool.
-
-    Args:
-        views: C cameras.
-        points: (N, 3) float64, in the unit of the views.
-        min_depth: depth that points must exceed.
-    """
-    at = views.viewmats[:, :3, :3].to(points) @ points.T + views.viewmats[:, :3, 3:].to(points)
-    x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
-    within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)
-    return (depth > min_depth) & within

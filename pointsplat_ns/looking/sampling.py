@@ -14,13 +14,13 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.candidates import Candidates
-from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_units, thinned
+from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_scene_units, in_units, thinned
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, photo_places
-from pointsplat_ns.looking.upright import Up, UprightBox, known_up, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import Up, known_up, pointing_up, upright_axis
 from pointsplat_ns.looking.whole import seen_from_above
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
@@ -131,17 +131,8 @@ class Sampler:
         return pointing_up(self.surface, axis, seen_from_above(self.scene, *self.content, self.surface, axis))
 
     @cached_property
-    def box(self) -> UprightBox:
-        """The upright box around the surface."""
-        return UprightBox.of(self.surface, self.up.direction)
-
-    @cached_property
-    def inside(self) -> bool:
-        """Whether the scene is one to look at from inside."""
-        return is_room(self.surface, self.box)
-
-    @cached_property
-    def _candidates(self) -> Candidates:
+    def candidates(self) -> Candidates:
+        """What views are drawn from and judged by. Raises DataError if nothing is visible."""
         shared = *self._traces, self.up.direction, self.resolution, self.settings
         return Candidates.of(self._in_units, self._step, *shared)
 
@@ -150,8 +141,8 @@ class Sampler:
         """``count`` views on the CPU. ``count``, ``seed`` and errors are those of :func:`sample_views`."""
         if count < 1:
             raise DataError(f"{count} views asked for; expected at least 1")
-        viewmats = self._candidates.views(count, torch.Generator().manual_seed(seed))
-        return views_in_scene_units(viewmats, *self.resolution, *self.content, self.settings)
+        viewmats = self.candidates.views(count, torch.Generator().manual_seed(seed))
+        return in_scene_units(views_of(viewmats, *self.resolution, UNITS, self.settings), *self.content)
 
 
 def unit_direction(up: Tensor) -> Tensor:
@@ -164,34 +155,3 @@ def unit_direction(up: Tensor) -> Tensor:
     if up.shape != (3,) or not 0 < float(up.norm()) < math.inf:
         raise DataError(f"up is {up.tolist()}; expected three numbers, not all 0")
     return up / up.norm()
-
-
-def views_in_scene_units(
-    viewmats: Tensor, width: int, height: int, centre: Tensor, diagonal: float, settings: LookingSettings = LOOKING
-) -> Views:
-    """Views of a scene from world-to-camera matrices (C, 4, 4) in units of its content, which has this centre (3,) and
-    diagonal, scene units."""
-    moved = viewmats.clone()
-    moved[:, :3, 3] = viewmats[:, :3, 3] * (diagonal / UNITS) - viewmats[:, :3, :3] @ centre
-    return views_of(moved, width, height, diagonal, settings)
-
-
-def is_room(surface: Surface, box: UprightBox) -> bool:
-    """Whether a scene is one to look at from inside: most of its free places are enclosed, and nearly all points that
-    are visible from outside are visible from them as well."""
-    settings = surface.settings
-    generator = torch.Generator().manual_seed(0)
-    places = box.places(settings.box_draws * settings.places, generator)
-    places = places[surface.clearance(places) > settings.min_clearance][: settings.places]
-    if len(places) == 0:
-        return False
-    visible, enclosure = surface.visible_from(places)
-    enclosed = enclosure >= settings.min_enclosure
-    if float(enclosed.float().mean()) < settings.min_enclosed_places:
-        return False
-    outside = torch.randn(settings.places, 3, generator=generator, **DOUBLES)
-    outside = outside / outside.norm(dim=1, keepdim=True) * 0.95 * UNITS  # clear of the content
-    from_inside, from_outside = (
-        float(some.any(0).float().mean()) for some in (visible[enclosed], surface.visible_from(outside)[0])
-    )
-    return from_inside >= settings.min_visible_inside * from_outside

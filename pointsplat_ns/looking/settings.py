@@ -16,8 +16,8 @@ class LookingSettings:
 
     Example:
         >>> from dataclasses import replace
-        >>> replace(LOOKING, candidates_per_view=16).places  # everything as by default, but more candidates
-        48
+        >>> replace(LOOKING, candidates_per_view=16).aims  # everything as by default, but more candidates
+        4
     """
 
     # Content (content.py)
@@ -115,21 +115,6 @@ class LookingSettings:
     max_surface_offset: float = 1.5
     """Bound of the distance of a point from the centre of its Gaussian along each axis, standard deviations."""
 
-    direction_rows: int = 40
-    """Number of rows of the grid of directions around a place, even; it has twice as many columns, of 4.5 degrees.
-    Cells have equal solid angles."""
-
-    relative_depth_tolerance: float = 0.05
-    """A point is visible if it is at most this share, plus ``depth_tolerance``, farther than the nearest point of its
-    cell."""
-
-    depth_tolerance: float = 0.1
-    """Distance that is added to ``relative_depth_tolerance``, units."""
-
-    clearance_neighbours: int = 5
-    """Rank of the point, nearest first, whose distance is the clearance of a place. A few points may float in the
-    air."""
-
     # Up (upright.py)
 
     content_radius: float = 6.0
@@ -172,9 +157,6 @@ class LookingSettings:
     seen_from_above_elevation: float = 30.0
     """Elevation of these cameras, degrees."""
 
-    box_yaw_step: float = 5.0
-    """Angle between the upright boxes that are tried, degrees."""
-
     # Cameras that show the whole, and the views of an opening (whole.py, opening.py)
 
     whole_quantiles: tuple[float, float] = (0.005, 0.995)
@@ -194,47 +176,16 @@ class LookingSettings:
     """Longer side of these pictures, pixels."""
 
     opening_turns: int = 12
-    """Number of cameras around the content, and of views from each enclosed place, that compete to be the first."""
+    """Number of cameras around the content that compete to be the first."""
 
     opening_elevation: float = 20.0
     """Elevation of the cameras around the content, degrees."""
 
     opening_candidates: int = 24
-    """Number of views from enclosed places, of those that show most surface, that compete."""
-
-    opening_inside: float = 1.1
-    """A scene that is no room is first shown from within if a view from there shows more than this many times as many
-    Gaussians as any of the whole. Captures of surroundings reach 1.3 to 5, flats without a wall 0.6 to 1.1."""
-
-    opening_beside: float = 0.5
-    """Views from within come after one of the whole if they show this share of the Gaussians that it shows."""
-
-    # Rooms, and views from enclosed places (sampling.py, opening.py)
-
-    places: int = 48
-    """Largest number of places in a scene that are tested."""
-
-    box_draws: int = 4
-    """Number of places that are drawn from the upright box for each of ``places``, because some are not free."""
-
-    eye_heights: tuple[float, float] = (0.3, 0.75)
-    """Smallest and largest height of cameras in a room, as shares of its height; (0, 1) turns the rule off."""
-
-    min_clearance: float = 0.5
-    """Smallest distance of these places from surfaces, units; 0 turns the rule off."""
-
-    min_enclosure: float = 0.6
-    """Smallest share of all directions in which a place has a surface, for the place to be enclosed."""
-
-    min_enclosed_places: float = 0.85
-    """Smallest share of the free places of its box that are enclosed, for a scene to be a room."""
-
-    min_visible_inside: float = 0.9
-    """Smallest share of the points, relative to those that are visible from outside, that are visible from the enclosed
-    places of a room."""
+    """Number of sampled views that compete with them."""
 
     gain_points: int = 4_096
-    """Largest number of points that views from these places compete for, and from which up is estimated."""
+    """Largest number of points from which up is estimated."""
 
     # Candidate views (candidates.py)
 
@@ -255,9 +206,6 @@ class LookingSettings:
 
     min_candidates: int = 64
     """Smallest number of candidates."""
-
-    likely_per_view: int = 3
-    """Number of likely candidates for each view, of which those are taken that complete each other."""
 
     half_gain_coverage: float = 0.5
     """Number of views that show a Gaussian at which one more counts a half."""

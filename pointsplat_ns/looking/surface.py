@@ -1,12 +1,7 @@
-"""Points on the surfaces of a scene, and which of them are visible from a place.
-
-A depth image of one view costs milliseconds. In a few times that, a few thousand points tell what is visible from a
-hundred places.
-"""
+"""Points on the surfaces of a scene."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +12,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.content import UNITS, positions_in_units
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,34 +57,6 @@ class Surface:
             normals=self.normals[rows],
             flatness=self.flatness[rows],
         )
-
-    def clearance(self, places: Tensor) -> Tensor:
-        """Distance (P,) from places (P, 3) to the nearest surface, units."""
-        distances = torch.cdist(places.float(), self.points.float(), compute_mode="donot_use_mm_for_euclid_dist")
-        return distances.topk(self.settings.clearance_neighbours, dim=1, largest=False).values[:, -1]
-
-    def visible_from(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Which points are visible from places.
-
-        Args:
-            places: (P, 3) positions, units.
-
-        Returns:
-            Whether each point is visible (P, M), and the share (P,) of all directions in which there is a surface.
-        """
-        rows, columns = self.settings.direction_rows, 2 * self.settings.direction_rows
-        offsets = self.points.float() - places.float()[:, None]  # [P, M, 3]
-        distances = offsets.norm(dim=2).clamp_min(1e-6)
-        row = ((offsets[..., 2] / distances + 1) * (rows / 2)).long().clamp(0, rows - 1)
-        turn = torch.atan2(offsets[..., 1], offsets[..., 0]) * (columns / (2 * math.pi))
-        cell = row * columns + turn.floor().long().remainder(columns)
-        nearest = torch.full((len(places), rows * columns), math.inf, **FLOATS).scatter_reduce_(
-            1, cell, distances, "amin"
-        )
-        farthest = nearest.gather(1, cell) * (1 + self.settings.relative_depth_tolerance)
-        visible = distances <= farthest + self.settings.depth_tolerance
-        enclosed = nearest.isfinite().view(-1, rows // 2, 2, columns // 2, 2).amax((2, 4))
-        return visible, enclosed.float().mean((1, 2))
 
 
 def _chances(scene: Gaussians, settings: LookingSettings) -> Tensor:

@@ -17,7 +17,6 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
 from pointsplat_ns.system.tensors import DOUBLES
@@ -67,51 +66,6 @@ def up_named(text: str | None) -> Up | None:
 def known_up(named: Up | None, scene: Gaussians) -> Up | None:
     """The up direction that needs no estimate: the named one, else the one that the scene's file declares."""
     return named or up_named(scene.up)
-
-
-@dataclass(frozen=True, eq=False)
-class UprightBox:
-    """The box that stands upright around most of a scene, in units of its content."""
-
-    frame: Tensor  # [3, 3] float64, orthonormal rows: two level directions and the upright one
-    low: Tensor  # [3] float64, its corners along these
-    high: Tensor  # [3] float64
-
-    @property
-    def up(self) -> Tensor:
-        """The upright direction (3,)."""
-        return self.frame[2]
-
-    @staticmethod
-    def of(surface: Surface, up: Tensor) -> UprightBox:
-        """The box with the smallest base of those that stand along ``up`` (3,), of length 1. It holds 90 % of the
-        points along each axis."""
-        points = _content(surface).points
-        yaw_step = math.radians(surface.settings.box_yaw_step)
-        turn = torch.arange(0, math.pi / 2, yaw_step, **DOUBLES)
-        right, ahead = level_directions(up, turn), level_directions(up, turn + math.pi / 2)
-        frames = torch.stack([right, ahead, up.expand_as(right)], dim=1)  # [T, 3, 3]
-        along = frames @ points.T
-        low, high = along.quantile(along.new_tensor(surface.settings.content_quantiles), dim=2)
-        narrowest = int((high - low)[:, :2].prod(1).argmin())
-        return UprightBox(frames[narrowest], low[narrowest], high[narrowest])
-
-    def places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Positions (count, 3), units, drawn evenly from the box."""
-        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
-        share = 2 * torch.rand(count, 3, generator=generator, **DOUBLES) - 1
-        return (middle + share * half) @ self.frame
-
-    def places_at_eyes(self, generator: torch.Generator, settings: LookingSettings = LOOKING) -> Tensor:
-        """Positions (P, 3), units, at the height of eyes."""
-        low, high = settings.eye_heights
-        places = self.places(settings.box_draws * settings.places, generator)
-        heights = self.heights(places)
-        return places[(heights > low) & (heights < high)]
-
-    def heights(self, places: Tensor) -> Tensor:
-        """Heights of places (P, 3): 0 at the bottom of the box, 1 at its top."""
-        return (places @ self.up - self.low[2]) / (self.high[2] - self.low[2]).clamp_min(1e-300)
 
 
 def level_directions(up: Tensor, turn: Tensor) -> Tensor:

@@ -179,7 +179,7 @@ def test_without_a_place_to_look_from_refinement_is_left_out_and_the_reason_is_s
     )
 
 
-def test_one_gaussian_is_compacted_and_none_are_refused(scene, short_search):
+def test_one_gaussian_is_compacted_and_none_are_refused(scene):
     one = scene[5:6].replace(opacities=torch.tensor([[4.0]]))
     for moved in (0.0, 0.3):  # nothing is closer to a scene than itself
         result = compacted(one, trained(tiny_refiner("scales", moved), 1), None)

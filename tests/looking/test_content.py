@@ -5,12 +5,11 @@ import math
 import pytest
 import torch
 
-from making import ball, box_room
+from making import ball, box_room, in_pictures
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.fill import fill
-from pointsplat_ns.looking.poses import in_pictures
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views

@@ -13,12 +13,12 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
-from making import ball, box_room
+from making import ball, in_pictures
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
-from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.looking.poses import in_pictures, look_at
+from pointsplat_ns.looking.content import in_units, thinned
+from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from sweeps import room_views
@@ -146,7 +146,7 @@ def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
 
 
 def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
-    room = box_room(0, 400)
+    room = thinned(ps.example_room(), 3000)
     data = FlightFrame.of(room, ps.sample_views(room, 2, 48, 36)).data([])
     assert data["drag"] == "look" and len(data["views"]) == 2
     upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.1]]), torch.tensor([0.0, 0.0, -1.0]))

@@ -20,6 +20,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.system.kernels import on_threads
 from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.views import Views
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LAB = REPOSITORY / "lab"
@@ -344,3 +345,17 @@ class FewViews(ViewSource):
             yield from sample_views(self._scene, 8, 48, 36, seed=number)
 
     others = sampled
+
+
+def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> torch.Tensor:
+    """Which points are in the pictures of views, (C, N) bool.
+
+    Args:
+        views: C cameras.
+        points: (N, 3) float64, in the unit of the views.
+        min_depth: depth that points must exceed.
+    """
+    at = views.viewmats[:, :3, :3].to(points) @ points.T + views.viewmats[:, :3, 3:].to(points)
+    x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
+    within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)
+    return (depth > min_depth) & within

@@ -125,9 +125,9 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled in free space, different ones for each split. Every second one of the training
+        """Pinhole cameras (C,) sampled, different ones for each split. Every second one of the training
         split is subsampled from a picture of the size that people look at. Raises DataError, which names the file, if
-        nothing of the scene is visible, or no free position is found."""
+        nothing of the scene is visible."""
         poses = self._poses
         seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
         count = poses.train if split == "train" else poses.test

@@ -82,14 +82,14 @@ class Viewpoints:
 
 
 def sampled_viewpoints(sampler: Sampler, settings: MergeSettings) -> Viewpoints | None:
-    """Views from where photos were taken, if traces in the scene show that, and from free places in it.
+    """Views that people may have taken, and whether traces in the scene show where.
 
     Args:
         sampler: of the scene.
         settings: ``sampled_views`` and ``view_seed``.
 
     Returns:
-        The viewpoints; None if no place in the scene is free, or no view is asked for.
+        The viewpoints; None if nothing of the scene is visible, or no view is asked for.
     """
     try:
         return Viewpoints(sampler.views(settings.sampled_views, settings.view_seed), sampler.photos is not None)

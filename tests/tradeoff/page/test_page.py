@@ -15,6 +15,7 @@ from PIL import Image
 import pointsplat_ns as ps
 from html_parts import names_nothing_outside, parts_of, policy_of
 from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
 from pointsplat_ns.tradeoff.page import write_sweep_page
@@ -100,7 +101,7 @@ def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_pa
 
 
 def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
-    room = ps.example_room()[::20]
+    room = thinned(ps.example_room(), 3000)
     stage, path = FlightFrame.of(room, room_views()), tmp_path / "new" / "scene.json"
     monkeypatch.setattr(page, "FLIGHT_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
     assert not page.keep_flight(stage, room, "room", path) and not path.parent.exists()

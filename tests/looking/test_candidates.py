@@ -1,0 +1,112 @@
+"""How likely views are, and which of them complete each other."""
+
+import math
+
+import pytest
+import torch
+
+from making import ball
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.candidates import EVIDENCE_WEIGHT, MIN_EMPTY, Candidates
+from pointsplat_ns.looking.content import UNITS
+from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.looking.traces import PhotoEvidence
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.rasterizer import pixels_of
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def wall(count: int = 3000, size: float = 0.06) -> Gaussians:
+    """A wall of flat Gaussians at y = 2, without SH, 8 x 8 units."""
+    generator = torch.Generator().manual_seed(3)
+    flat = ball(count, 0, opacity=8.0)
+    at = 8 * torch.rand(count, 2, generator=generator) - 4
+    means = torch.stack([at[:, 0], torch.full((count,), 2.0), at[:, 1]], dim=1)
+    scales = torch.full((count, 3), math.log(size))
+    scales[:, 1] = math.log(1e-3)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4).clone()
+    return flat.replace(means=means, scales=scales, quats=quats)
+
+
+def candidates(scene: Gaussians, step: int = 1) -> Candidates:
+    generator = torch.Generator().manual_seed(0)
+    evidence = PhotoEvidence.of(scene, generator)
+    return Candidates.of(scene, step, evidence, None, UP, (640, 360), LOOKING)
+
+
+def seen_from(*eyes: tuple[float, float, float]):
+    at = torch.tensor(eyes, dtype=torch.float64)
+    return views_of(look_at(at, at + torch.tensor([0.0, 1.0, 0.0]), UP), 640, 360, UNITS)
+
+
+def test_the_likelihood_is_that_of_its_formula():
+    scene = wall()
+    found, views = candidates(scene), seen_from((0, 0, 0), (0, -1, 0))
+    likelihoods, shown = found.judged(views)
+    for row, view in enumerate(views.resized(LOOKING.candidate_side)):
+        pixels = pixels_of(found.few, view).double()
+        away = (found.few.means.double() - torch.tensor([0.0, -row, 0.0])).norm(dim=1)
+        blur = float((pixels * 0.06 / away).sum() / pixels.sum())
+        empty = 1 - float(pixels.sum()) / (view.width * view.height)
+        share = (float((pixels > LOOKING.min_candidate_pixels).sum()) + 1) / len(scene)
+        expected = math.log(share / (empty + MIN_EMPTY) / blur**2)
+        # 0.02: the antialiased rasterizer lowers opacities a little
+        assert float(likelihoods[row]) == pytest.approx(expected, abs=0.1)
+        assert float(shown[row].double().mean()) == pytest.approx(share, rel=0.1)
+
+
+def test_views_of_much_are_likelier_than_of_little_of_holes_or_of_what_is_near():
+    found = candidates(wall())
+    good, hole, close, away = found.judged(seen_from((0, -1, 0), (4, -1, 0), (0, 1.9, 0), (0, 3, 0)))[0].tolist()
+    assert good > max(hole, close, away) + 1
+    assert away == min(good, hole, close, away), "it shows nothing"
+
+
+def test_evidence_of_sh_counts_where_there_are_sh():
+    scene = ball(500, 1, opacity=5.0)
+    without = scene.replace(features_rest=torch.zeros_like(scene.features_rest))
+    views = seen_from((0, -4, 0), (0, -5, 0))
+    found = candidates(scene)
+    eyes = torch.tensor([[0.0, -4.0, 0.0], [0.0, -5.0, 0.0]], dtype=torch.float64)
+    added = found.judged(views)[0] - candidates(without).judged(views)[0]
+    torch.testing.assert_close(added, EVIDENCE_WEIGHT * found.evidence.at(eyes).double())
+
+
+def test_the_next_view_shows_what_earlier_ones_do_not_and_unlikely_ones_come_last():
+    found = candidates(wall(300))
+    shown = torch.zeros(4, 300, dtype=torch.bool)
+    shown[0, :150] = shown[1, :149] = True
+    shown[2, 150:250] = shown[3, 250:] = True
+    likelihoods = torch.tensor([0.0, 0.0, 0.0, -9.0], dtype=torch.float64)
+    assert found.completing(likelihoods, shown, 4) == [0, 2, 1, 3]
+    assert found.completing(likelihoods, shown, 9) == [0, 2, 1, 3] and found.completing(likelihoods, shown, 0) == []
+
+
+@pytest.mark.parametrize("size", [-1e4, -80.0, 80.0, 1e4])
+def test_gaussians_of_any_size_have_views_of_finite_likelihood(size):
+    scene = wall(400)
+    scales = scene.scales.clone()
+    scales[::2] = size
+    found = candidates(scene.replace(scales=scales))
+    viewmats = found.views(5, torch.Generator().manual_seed(0))
+    assert bool(viewmats.isfinite().all())
+    assert bool(found.judged(views_of(viewmats, 640, 360, UNITS))[0].isfinite().all())
+
+
+def test_a_scene_that_was_thinned_before_is_as_sharp_as_before():
+    scene = wall(2000)
+    thinned = scene.replace(scales=scene.scales + 0.5 * math.log(4))
+    torch.testing.assert_close(candidates(thinned, 4).widths, candidates(scene).widths)
+
+
+def test_no_camera_stands_below_the_floor():
+    floor = wall(1500)
+    floor = floor.replace(
+        means=floor.means[:, [0, 2, 1]] - torch.tensor([0.0, 0.0, 2.0]), scales=floor.scales[:, [0, 2, 1]]
+    )
+    views = Sampler(floor, (64, 36), Up(UP)).views(24)
+    eyes = -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
+    assert float(eyes[:, 2].min()) > -0.01
