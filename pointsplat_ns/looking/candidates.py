@@ -7,10 +7,11 @@ likelihood, up to a constant, is
 
     log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence
 
-with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture
-of the angle that a Gaussian subtends, radians, and the evidence of SH for its place. The numbers are rounded
-from a logistic regression between the poses of six captures and candidates: of a pose of a seventh and a candidate, the
-pose is the more likely one in 9 cases of 10. ``docs/concepts/sampled_views.md`` says more.
+with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture of the
+angle that a Gaussian subtends, radians, and the evidence of SH for its place. A logistic regression between the poses
+of six captures and candidates gives 1.2, 1.3 and 0.75 without blur: with each capture left out in turn, a pose of it is
+likelier than a candidate in 89 % of cases. Blur tells poses from candidates no better; views from within walls, which
+captures lack, need it. ``docs/concepts/sampled_views.md`` says more.
 """
 
 from __future__ import annotations
