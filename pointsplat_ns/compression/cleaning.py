@@ -1,7 +1,7 @@
 """Finds the Gaussians of a scene that no picture needs, so that a budget is spent on the others.
 
 Two rules remove a Gaussian. The first: it cannot be drawn, because a value is NaN or infinite, or because it is fainter
-than the rasterizer draws. The second: no camera sees it. Cameras stand where sampled views do and look in all
+than the rasterizer draws. The second: no camera sees it. Cameras stand at the likeliest places and look in all
 directions; a Gaussian is unseen if it has no blend weight (its opacity at a pixel times the transmittance in front of
 it) on any pixel of any image. So a visible background stays, and so does a lamp that hangs in the air.
 """
@@ -20,7 +20,7 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.content import content_size, in_units
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
@@ -169,11 +169,12 @@ def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
 
 
 def _views_all_around(scene: Gaussians) -> Views:
-    """Views in six directions from the places of sampled views, six in a row for each place. Raises DataError if
+    """Views in six directions from the places of the likeliest views, six in a row for each place. Raises DataError if
     nothing is visible."""
     # Without SH, so that places do not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
-    places = invert_rigid(sample_views(without_sh, CLEANING.places, seed=CLEANING.seed).viewmats)[:, :3, 3]
+    views = Sampler(without_sh).views(CLEANING.places, CLEANING.seed, likeliest=True)  # few are behind walls
+    places = invert_rigid(views.viewmats)[:, :3, 3]
     rotations = _six_directions().to(places)
     viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations

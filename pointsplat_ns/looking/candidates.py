@@ -32,7 +32,7 @@ from pointsplat_ns.looking.settings import LookingSettings
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths, means_around
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
 
 MIN_EMPTY = 0.01
@@ -97,12 +97,13 @@ class Candidates:
         around = means_around(widths, settings.width_neighbours)
         return Candidates(few, targets, widths.exp().float(), around, evidence, places, up, resolution, settings)
 
-    def views(self, count: int, generator: torch.Generator) -> Tensor:
-        """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other."""
+    def views(self, count: int, generator: torch.Generator, likeliest: bool = False) -> Tensor:
+        """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other, or of the
+        likeliest ones, which may show the same."""
         settings = self.settings
         drawn = self._drawn(max(settings.min_candidates, settings.candidates_per_view * count), generator)
         likelihoods, shown = self.judged(views_of(drawn, *self.resolution, UNITS, settings))
-        return drawn[self.completing(likelihoods, shown, count)]
+        return drawn[likelihoods.topk(count).indices if likeliest else self.completing(likelihoods, shown, count)]
 
     def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
         """Indices of at most ``count`` views, as :meth:`judged`. The next one always has the largest product of its
@@ -162,7 +163,7 @@ class Candidates:
         rise = (ahead @ self.up) / ahead.norm(dim=2).clamp_min(1e-9)
         pitch = torch.rad2deg(torch.asin(rise.clamp(-1, 1)))
         usual = (pitch - settings.pitch_mean).abs().argmin(1)
-        return look_at(eyes, targets[torch.arange(count, device="cpu"), usual], self.up)
+        return look_at(eyes, targets[torch.arange(count, **INDICES), usual], self.up)
 
     def _targets(self, count: int, generator: torch.Generator) -> Tensor:
         """Indices (count,) of Gaussians to look at, each as likely as any other."""

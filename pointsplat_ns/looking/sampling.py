@@ -137,11 +137,12 @@ class Sampler:
         return Candidates.of(self._in_units, self._step, *shared)
 
     @torch.no_grad()
-    def views(self, count: int, seed: int = 0) -> Views:
-        """``count`` views on the CPU. ``count``, ``seed`` and errors are those of :func:`sample_views`."""
+    def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:
+        """``count`` views on the CPU. ``count``, ``seed`` and errors are those of :func:`sample_views`. Views complete
+        each other, or are the likeliest, which may show the same."""
         if count < 1:
             raise DataError(f"{count} views asked for; expected at least 1")
-        viewmats = self.candidates.views(count, torch.Generator().manual_seed(seed))
+        viewmats = self.candidates.views(count, torch.Generator().manual_seed(seed), likeliest)
         return in_scene_units(views_of(viewmats, *self.resolution, UNITS, self.settings), *self.content)
 
 

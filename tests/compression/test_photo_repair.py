@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import FewViews
+from making import FewViews, views_from_within
 from pointsplat_ns.compression import photo_repair as module
 from pointsplat_ns.compression.optimiser import (
     RATES,
@@ -43,7 +43,7 @@ def pruned(hollow_ball):
 @pytest.fixture(scope="module")
 def photos(hollow_ball):
     """Photos of the ball in other colours than the dense scene has: only photos can teach them."""
-    views = sample_views(hollow_ball, 18, 48, 36, seed=5)
+    views = views_from_within((5.0, 0.0, 0.0), 18, 48, 36)
     photographed = hollow_ball.replace(features_dc=hollow_ball.features_dc + 0.4)
     return [Example(view, render(photographed, view).detach()) for view in views]
 
@@ -90,7 +90,7 @@ def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pru
     trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
     assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
     if kept:
-        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.2
+        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.1
 
 
 def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, ball, cloud, run_of
+from making import SHARED_DATA, ball, cloud, run_of, views_from_within
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.placing import run_frame
 from pointsplat_ns.compression.posed_scene import PosesFile, read_posed
@@ -32,7 +32,7 @@ def scene() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def views(scene) -> ps.Views:
-    return ps.sample_views(scene, 6, 64, 48)
+    return views_from_within((0.0, 0.0, 0.0), 6, 64, 48)
 
 
 def moved(views: ps.Views, by: float) -> ps.Views:

@@ -8,7 +8,7 @@ import torch
 
 import golden
 import pointsplat_ns as ps
-from making import assert_same_on_any_threads, box_room
+from making import assert_same_on_any_threads, box_room, views_from_within
 from pointsplat_ns.rasterizer import pixels_of, projection
 from pointsplat_ns.rasterizer import scene as scene_module
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
@@ -62,7 +62,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def views(room):
-    return ps.sample_views(room, 2, 48, 36)
+    return views_from_within((0.0, 0.0, 0.0), 2, 48, 36)
 
 
 def test_quality_is_handed_on(room, views):

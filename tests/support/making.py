@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.system.kernels import on_threads
@@ -359,3 +360,12 @@ def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> t
     x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
     within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)
     return (depth > min_depth) & within
+
+
+def views_from_within(centre: tuple[float, float, float], count: int, width: int, height: int) -> Views:
+    """Cameras up to half a unit from a place, which look to all sides, about level."""
+    generator = torch.Generator().manual_seed(11)
+    eyes = torch.tensor(centre) + torch.rand(count, 3, generator=generator) - 0.5
+    turns = 2 * math.pi * torch.arange(count) / count
+    ahead = torch.stack([turns.cos(), turns.sin(), 0.4 * torch.rand(count, generator=generator) - 0.3], dim=1)
+    return views_of(look_at(eyes.double(), (eyes + ahead).double()), width, height, 5.0)
