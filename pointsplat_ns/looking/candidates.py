@@ -54,9 +54,9 @@ class Candidates:
     targets: Tensor
     """Indices (t,) of those that are opaque enough to be looked at."""
     widths: Tensor
-    """Logarithms (n,) of their widths before they were enlarged, float32."""
+    """Widths (n,) before they were enlarged, float32: geometric means of the two larger standard deviations."""
     widths_around: Tensor
-    """Means (n,) of these over neighbours."""
+    """Means (n,) of their logarithms over neighbours, float64."""
     evidence: PhotoEvidence
     places: PhotoPlaces | None
     """Places that photos may have been taken from; None if nothing of the scene tells."""
