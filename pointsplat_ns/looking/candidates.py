@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
-from pointsplat_ns.looking.content import UNITS, thinned
+from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
+from pointsplat_ns.looking.content import UNITS, thinned, thinning
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.settings import LookingSettings
@@ -90,7 +90,7 @@ class Candidates:
         few = thinned(scene, settings.candidate_gaussians)
         along = curve_keys(unit_cells(few.means)).argsort(stable=True)
         few = few[along]
-        enlarged = 0.5 * math.log(step * max(1, len(scene) // settings.candidate_gaussians))
+        enlarged = 0.5 * math.log(step * thinning(len(scene), settings.candidate_gaussians))
         widths = log_widths(few.scales) - enlarged
         alphas = few.alphas
         targets = (alphas > min(settings.min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
@@ -172,9 +172,8 @@ class Candidates:
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
         """Logarithms (V,) of the likelihood of views in units of the content, up to a constant, float64, and which of
         the Gaussians each shows (V, n), bool."""
-        settings, viewmats = self.settings, views.viewmats.double()
+        settings, eyes = self.settings, invert_rigid(views.viewmats.double())[:, :3, 3]
         views = replace(views.resized(settings.candidate_side), rasterize_mode="antialiased")
-        eyes = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
         likelihoods, shown = [], []
         for eye, pixels in zip(eyes, each_view(self.few, views, pixels_of), strict=True):
             covered = float(pixels.double().sum())

@@ -94,9 +94,14 @@ def in_scene_units(views: Views, centre: Tensor, size: float) -> Views:
     return dataclasses.replace(views, viewmats=viewmats, near_plane=views.near_plane * size / UNITS)
 
 
+def thinning(count: int, max_count: int) -> int:
+    """The step of :func:`thinned`: of ``count`` Gaussians every so many-th is left."""
+    return max(1, count // max_count)
+
+
 def thinned(scene: Gaussians, max_count: int) -> Gaussians:
     """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
-    step = max(1, len(scene) // max_count)
+    step = thinning(len(scene), max_count)
     return _enlarged(scene[::step], step)
 
 

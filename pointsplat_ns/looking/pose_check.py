@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.looking.content import content_size, thinned
+from pointsplat_ns.looking.content import content_size, thinned, thinning
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
 from pointsplat_ns.rasterizer import pixels_of, render
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
@@ -88,7 +88,7 @@ def pose_faults(scene: Gaussians, views: Views, settings: PoseCheckSettings = PO
     if not bool(visible.any()) or len(views) == 0:
         return PoseFaults(0, 0, 0)
     every = scene[visible]
-    drawn, step = thinned(every, settings.max_count), max(1, len(every) // settings.max_count)
+    drawn, step = thinned(every, settings.max_count), thinning(len(every), settings.max_count)
     stds = every[::step].stds.double().sort(dim=1).values
     widths = (stds[:, 1] * stds[:, 2]).sqrt()  # scene units
     limit = max(settings.max_angle, settings.coarse_angle * float(widths.median()) / (0.5 * content_size(drawn)[1]))

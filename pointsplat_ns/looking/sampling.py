@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.candidates import Candidates
-from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_scene_units, in_units, thinned
+from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_scene_units, in_units, thinned, thinning
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION
@@ -93,7 +93,7 @@ class Sampler:
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
         self.scene = thinned(scene.detach(), settings.sampled_count).to("cpu")  # many small operations
-        self._step = max(1, len(scene) // settings.sampled_count)
+        self._step = thinning(len(scene), settings.sampled_count)
         self.resolution, self.settings, self._up = resolution, settings, known_up(up, scene)
 
     @cached_property
@@ -133,8 +133,9 @@ class Sampler:
     @cached_property
     def candidates(self) -> Candidates:
         """What views are drawn from and judged by. Raises DataError if nothing is visible."""
-        shared = *self._traces, self.up.direction, self.resolution, self.settings
-        return Candidates.of(self._in_units, self._step, *shared)
+        evidence, places = self._traces
+        up, resolution = self.up.direction, self.resolution
+        return Candidates.of(self._in_units, self._step, evidence, places, up, resolution, self.settings)
 
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:

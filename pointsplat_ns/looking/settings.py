@@ -89,15 +89,15 @@ class LookingSettings:
     """Size of the box of candidate places, relative to that of the compared Gaussians without outliers."""
 
     min_sh_evidence: float = 2.0
-    """Smallest evidence of the best place by SH: explained energy relative to SH of random directions; infinity turns
-    photo places off in scenes with SH. Captures reach 3.3 to 3.7 at photo places. Scenes seen from all around reach 1.2
-    to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB). ``lab/training/photo_places.py`` prints
-    it."""
+    """Smallest evidence of the best place by SH, explained energy relative to SH of random directions, for photo places
+    to count in the estimate of up and in weights; infinity turns that off. Captures reach 3.3 to 3.7 at photo places.
+    Scenes seen from all around reach 1.2 to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB).
+    ``lab/training/photo_places.py`` prints it."""
 
     min_size_evidence: float = 0.48
-    """Smallest evidence of the best place by size: correlation of the logarithms of size and distance; infinity turns
-    photo places off in scenes without SH. Captures from outside reach 0.50 to 0.78, rooms, where any free place will
-    do, 0.23 to 0.46. ``lab/training/photo_places.py`` prints it."""
+    """The same in scenes without SH, by the correlation of the logarithms of size and distance. Captures from outside
+    reach 0.50 to 0.78, rooms, where any free place will do, 0.23 to 0.46. ``lab/training/photo_places.py`` prints
+    it."""
 
     # Surface points (surface.py)
 
@@ -119,6 +119,9 @@ class LookingSettings:
 
     content_radius: float = 6.0
     """Radius, around the centre of the content, within which points belong to the content, units."""
+
+    upright_points: int = 4_096
+    """Largest number of surface points from which up is estimated."""
 
     upright_directions: int = 400
     """Number of directions that are tried, evenly over half of a sphere: about 7 degrees apart."""
@@ -183,9 +186,6 @@ class LookingSettings:
 
     opening_candidates: int = 24
     """Number of sampled views that compete with them."""
-
-    gain_points: int = 4_096
-    """Largest number of points from which up is estimated."""
 
     # Candidate views (candidates.py)
 

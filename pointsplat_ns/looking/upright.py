@@ -134,7 +134,7 @@ def _content(surface: Surface) -> Surface:
     """Some of the points near the content; of all points if none is near."""
     near = surface.points.norm(dim=1) < surface.settings.content_radius
     near = near if bool(near.any()) else torch.ones_like(near)
-    return surface[near.nonzero()[: surface.settings.gain_points, 0]]
+    return surface[near.nonzero()[: surface.settings.upright_points, 0]]
 
 
 def levelness(axes: Tensor, photos: PhotoPlaces) -> Tensor:

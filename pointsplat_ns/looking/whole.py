@@ -1,4 +1,4 @@
-"""Cameras around a scene that show all of it, and the number of Gaussians that a camera shows.
+"""Cameras around a scene that show all of it, and whether more is seen from above or from below.
 
 All is in units of the content.
 """
@@ -13,11 +13,10 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, in_units, thinned
 from pointsplat_ns.looking.poses import look_at, views_of
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
-from pointsplat_ns.system.tensors import FLAGS, FLOATS
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
 
@@ -53,42 +52,23 @@ def whole_views(
     return views_of(viewmats, width, height, UNITS, settings)
 
 
-def few_in_units(scene: Gaussians, count: int, centre: Tensor, diagonal: float) -> Gaussians:
-    """At most about ``count`` of the Gaussians, enlarged to cover as much as all, in units, on the CPU."""
-    return in_units(thinned(scene.detach(), count).to("cpu"), centre.cpu(), diagonal)
-
-
-def shown(few: Gaussians, views: Views, side: int) -> Tensor:
-    """Which Gaussians each view shows, (C, N) bool: they are in its picture, large enough, and not hidden.
-
-    Gaussians are many where photos showed detail. So their number says how much of interest a picture holds.
-
-    Args:
-        few: N Gaussians of a scene, enlarged to cover as much as all, on the CPU.
-        views: C views of them.
-        side: longer side of the pictures, pixels.
-    """
-    rows = [pixels_of(few, view) > LOOKING.min_shown_pixels for view in views.resized(side)]
-    return torch.stack(rows) if rows else torch.zeros(0, len(few), **FLAGS)
-
-
 def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: Surface, axis: Tensor) -> float:
     """Logarithm of the ratio of the Gaussians that are seen from above to those that are seen from below, if ``axis``
     (3,) points up; each from the best of some cameras around the content.
 
     Args:
-        scene: N Gaussians.
+        scene: N Gaussians on the CPU.
         centre: (3,) of its content.
         diagonal: of its content, scene units.
         surface: points of the scene, and the settings.
         axis: (3,) of length 1.
     """
     settings, turns = surface.settings, around(surface.settings.seen_from_above_turns)
-    few = few_in_units(scene, settings.pictured_count, centre, diagonal)
+    few = in_units(thinned(scene, settings.pictured_count), centre, diagonal)
 
     def most(up: Tensor) -> int:
-        views = whole_views(surface, up, turns, settings.seen_from_above_elevation)
-        return int(shown(few, views, settings.pictured_side).sum(1).max())
+        views = whole_views(surface, up, turns, settings.seen_from_above_elevation).resized(settings.pictured_side)
+        return max(int((pixels_of(few, view) > settings.min_shown_pixels).sum()) for view in views)
 
     return math.log((most(axis) + 1) / (most(-axis) + 1))
 

@@ -79,7 +79,7 @@ def test_the_scene_that_is_best_in_the_compared_photos_is_the_result(hollow_ball
     assert trained.scene is pruned and trained.after == trained.before
 
 
-@pytest.mark.parametrize(("known", "kept"), [(0.6, True), (1.0, False)])
+@pytest.mark.parametrize(("known", "kept"), [(0.65, True), (1.0, False)])
 def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pruned, photos, known, kept):
     """The given scene knows them in part, as one does that comes from a scene trained on them."""
     renders = [render(pruned, photo.view).detach() for photo in photos]
@@ -90,7 +90,7 @@ def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pru
     trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
     assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
     if kept:
-        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.1
+        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.2
 
 
 def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):

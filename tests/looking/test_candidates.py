@@ -8,6 +8,7 @@ import torch
 
 from making import ball
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.candidates import EVIDENCE_WEIGHT, MIN_EMPTY, Candidates
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.poses import look_at, views_of
@@ -109,5 +110,5 @@ def test_no_camera_stands_below_the_floor():
         means=floor.means[:, [0, 2, 1]] - torch.tensor([0.0, 0.0, 2.0]), scales=floor.scales[:, [0, 2, 1]]
     )
     views = Sampler(floor, (64, 36), Up(UP)).views(24)
-    eyes = -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
+    eyes = invert_rigid(views.viewmats)[:, :3, 3]
     assert float(eyes[:, 2].min()) > -0.01
