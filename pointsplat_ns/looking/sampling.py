@@ -127,7 +127,7 @@ class Sampler:
         """Which way is up. Raises DataError if it has to be estimated, and nothing of the scene is visible."""
         if self._up is not None:
             return self._up
-        axis = upright_axis(self.surface, self.photos)
+        axis = upright_axis(self.surface, None if self.photos is None else self._traces[0])
         return pointing_up(self.surface, axis, seen_from_above(self.scene, *self.content, self.surface, axis))
 
     @cached_property

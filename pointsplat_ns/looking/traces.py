@@ -27,7 +27,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
-from pointsplat_ns.system.tensors import FLOATS
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 class PhotoPlaces(NamedTuple):
@@ -127,6 +127,15 @@ class PhotoEvidence:
                 [explained_energy(self.means - place, self.sh, self.settings).mean() for place in places]
             )
         return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
+
+    def towards(self, directions: Tensor) -> Tensor:
+        """Mean :func:`explained_energy` of far away places in each direction (D, 3), of length 1; (D,) float64, 1 for
+        SH of random directions. Without SH, 1 for all."""
+        if not self.has_sh:
+            return torch.ones(len(directions), **DOUBLES)
+        basis = sh_basis(-directions.float(), math.isqrt(self.sh.shape[1] + 1) - 1)[:, 1:].double()
+        products = torch.einsum("nkc,nlc->kl", self.sh, self.sh).double() / len(self.sh)  # the mean over Gaussians
+        return ((basis @ products) * basis).sum(1) / basis.square().sum(1) * self.sh.shape[1]
 
 
 def photo_places(evidence: PhotoEvidence, generator: torch.Generator) -> PhotoPlaces | None:

@@ -2,8 +2,8 @@
 
 Objects that stand upright have surfaces that are level or vertical (floors, tables, walls, legs), whichever way
 furniture is turned; and level surfaces share their heights (a floor, a table top). The Gaussians show both: the
-shortest axis of a flat Gaussian is the normal of its surface. Photo places, if they are known, show more: people move
-about, and hold cameras at about one height.
+shortest axis of a flat Gaussian is the normal of its surface. SH, where photos left traces in them, show more: few
+photos are taken straight down, and fewer straight up.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of
 from pointsplat_ns.looking.surface import Surface
-from pointsplat_ns.looking.traces import PhotoPlaces
+from pointsplat_ns.looking.traces import PhotoEvidence
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -80,7 +80,7 @@ def _across(axes: Tensor) -> Tensor:
     return right / right.norm(dim=-1, keepdim=True)
 
 
-def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
+def upright_axis(surface: Surface, evidence: PhotoEvidence | None = None) -> Tensor:
     """The axis (3,) along which a scene stands, float64, of length 1 and of either sign.
 
     It is an axis of the world if that fits about as well as the best direction, and y if that fits about as well as the
@@ -88,13 +88,16 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
 
     Args:
         surface: points of the scene, and the settings.
-        photos: photo places in units of the content, if known.
+        evidence: Gaussians that tell from which directions photos were taken, if they do.
     """
     content, settings = _content(surface), surface.settings
 
     def scores_of(axes: Tensor) -> Tensor:
         scores = uprightness(axes, content)
-        return scores if photos is None else scores + settings.photo_level_weight * levelness(axes, photos)
+        if evidence is None:
+            return scores
+        photographed_along = 0.5 * (evidence.towards(axes) + evidence.towards(-axes))
+        return scores + settings.photo_direction_weight * (1 - photographed_along)
 
     index = torch.arange(settings.upright_directions, **DOUBLES) + 0.5
     height = 1 - index / settings.upright_directions  # Fibonacci's spiral
@@ -107,7 +110,7 @@ def upright_axis(surface: Surface, photos: PhotoPlaces | None = None) -> Tensor:
         found = torch.cat([found, _nearby(found, math.radians(degrees))])
         scores = scores_of(found)
         found = found[scores.topk(settings.refined_directions).indices]
-    of_world, of_y = settings.usual_axis_factors if photos is None else (1.05, 1.0)
+    of_world, of_y = settings.usual_axis_factors if evidence is None else (1.05, 1.0)
     world = torch.eye(3, **DOUBLES)
     world_scores = world.new_tensor([of_world, of_world * of_y, of_world]) * scores_of(world)
     return world[world_scores.argmax()] if bool(world_scores.max() >= scores.max()) else found[0]
@@ -135,29 +138,6 @@ def _content(surface: Surface) -> Surface:
     near = surface.points.norm(dim=1) < surface.settings.content_radius
     near = near if bool(near.any()) else torch.ones_like(near)
     return surface[near.nonzero()[: surface.settings.upright_points, 0]]
-
-
-def levelness(axes: Tensor, photos: PhotoPlaces) -> Tensor:
-    """Levelness of photo places for each upright axis: 1 if all have the same height.
-
-    It is 1 less the ratio of the standard deviation of the heights to that along the direction of the largest spread.
-
-    Args:
-        axes: (D, 3) of length 1.
-        photos: places in any unit of length.
-
-    Returns:
-        (D,) float64 in [0, 1]; 0 if all places are one.
-    """
-    places, shares = photos.places.double(), photos.shares.double().square()  # the likeliest places alone
-    shares = shares / shares.sum()
-    offsets = places - shares @ places
-    spread = offsets.T @ (shares[:, None] * offsets)
-    widest = torch.linalg.eigvalsh(spread)[-1]
-    if float(widest) <= 0:
-        return torch.zeros(len(axes), **DOUBLES)
-    along = (axes @ spread * axes).sum(1).clamp_min(0)
-    return 1 - (along / widest).clamp_max(1).sqrt()
 
 
 def uprightness(axes: Tensor, content: Surface) -> Tensor:

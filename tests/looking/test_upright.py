@@ -19,8 +19,9 @@ from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
-from pointsplat_ns.looking.traces import PhotoPlaces
-from pointsplat_ns.looking.upright import Up, axis_named, levelness, pointing_up, upright_axis
+from pointsplat_ns.looking.traces import PhotoEvidence, explained_energy, unit_sh
+from pointsplat_ns.looking.upright import Up, axis_named, pointing_up, upright_axis
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -88,26 +89,32 @@ def test_points_stand_for_what_can_be_seen_and_are_finite():
     assert bool(Surface.of(flat, *content_size(flat)).points.isfinite().all())
 
 
-def test_places_lie_level_across_the_axis_that_they_do_not_spread_along():
-    ring = torch.stack([PLACES.cos(), PLACES.sin(), torch.zeros(60)], dim=1).double() + 5
-    shares = torch.full((60,), 1 / 60)
-    found = levelness(torch.eye(3).double(), PhotoPlaces(ring, shares))
-    assert torch.allclose(found, torch.tensor([0.0, 0.0, 1.0]).double(), atol=0.1)
-    # a place that counts for nothing says nothing
-    far = torch.cat([ring, torch.tensor([[5.0, 5.0, 1e6]]).double()])
-    assert torch.allclose(
-        levelness(torch.eye(3).double(), PhotoPlaces(far, torch.cat([shares, torch.zeros(1)]))), found
-    )
+def seen_from(directions: torch.Tensor) -> PhotoEvidence:
+    """Gaussians at the origin, with the SH that a photo from each direction (n, 3) leaves."""
+    sh = unit_sh(sh_basis(-directions.float(), 3)[:, 1:, None].expand(-1, -1, 3))
+    return PhotoEvidence(torch.zeros_like(directions), sh, torch.zeros(len(directions)).double())
+
+
+def ring_around(axis: int) -> torch.Tensor:
+    """Directions (60, 3) at a right angle to an axis of the world."""
+    return torch.stack([PLACES.cos(), PLACES.sin(), torch.zeros(60)], dim=1).double().roll(axis + 1, 1)
+
+
+def test_evidence_lies_in_the_directions_from_which_photos_were_taken():
+    evidence = seen_from(torch.tensor([[0.0, 0.6, 0.8]]).double().expand(5, -1))
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.manual_seed(0)), dim=1).double()
+    found = evidence.towards(directions)
+    one_by_one = torch.stack([explained_energy(evidence.means - u, evidence.sh).mean() for u in directions])
+    assert torch.allclose(found, one_by_one.double(), rtol=1e-4, atol=1e-5)
+    assert float(evidence.towards(torch.tensor([[0.0, 0.6, 0.8]]).double())) > float(found.max())
 
 
 def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
-    """A cube has three; photos were taken from all around it, at about one height."""
+    """A cube has three; photos were taken from all around it, at its height."""
     cube = plates(*(((side * x, side * y, side * z), (1 - x, 1 - y, 1 - z)) for x, y, z in EDGES for side in (-1, 1)))
     surface = Surface.of(cube, *content_size(cube))
     for axis in range(3):
-        ring = torch.zeros(60, 3).double()
-        ring[:, (axis + 1) % 3], ring[:, (axis + 2) % 3] = 8 * PLACES.cos().double(), 8 * PLACES.sin().double()
-        found = upright_axis(surface, PhotoPlaces(ring, torch.full((60,), 1 / 60)))
+        found = upright_axis(surface, seen_from(ring_around(axis)))
         assert float(found[axis].abs()) > math.cos(math.radians(3))
 
 
