@@ -28,7 +28,7 @@ from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cel
 from pointsplat_ns.looking.content import UNITS, thinned, thinning
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.poses import look_at, views_of
-from pointsplat_ns.looking.settings import LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths, means_around
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
@@ -64,7 +64,6 @@ class Candidates:
     """(3,) of length 1."""
     resolution: tuple[int, int]
     """Width and height of the pictures, pixels."""
-    settings: LookingSettings
 
     @staticmethod
     def of(
@@ -74,7 +73,6 @@ class Candidates:
         places: PhotoPlaces | None,
         up: Tensor,
         resolution: tuple[int, int],
-        settings: LookingSettings,
     ) -> Candidates:
         """Candidates of a scene.
 
@@ -84,25 +82,23 @@ class Candidates:
             evidence, places: of this scene.
             up: (3,) of length 1.
             resolution: width and height, pixels.
-            settings: those of candidate views.
         """
         scene = scene[scene.usable()]
-        few = thinned(scene, settings.candidate_gaussians)
+        few = thinned(scene, LOOKING.candidate_gaussians)
         along = curve_keys(unit_cells(few.means)).argsort(stable=True)
         few = few[along]
-        enlarged = 0.5 * math.log(step * thinning(len(scene), settings.candidate_gaussians))
+        enlarged = 0.5 * math.log(step * thinning(len(scene), LOOKING.candidate_gaussians))
         widths = log_widths(few.scales) - enlarged
         alphas = few.alphas
-        targets = (alphas > min(settings.min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
-        around = means_around(widths, settings.width_neighbours)
-        return Candidates(few, targets, widths.exp().float(), around, evidence, places, up, resolution, settings)
+        targets = (alphas > min(LOOKING.min_opacity, 0.5 * float(alphas.max()))).nonzero()[:, 0]
+        around = means_around(widths, 9)
+        return Candidates(few, targets, widths.exp().float(), around, evidence, places, up, resolution)
 
     def views(self, count: int, generator: torch.Generator, likeliest: bool = False) -> Tensor:
         """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other, or of the
         likeliest ones, which may show the same."""
-        settings = self.settings
-        drawn = self._drawn(max(settings.min_candidates, settings.candidates_per_view * count), generator)
-        likelihoods, shown = self.judged(views_of(drawn, *self.resolution, UNITS, settings))
+        drawn = self._drawn(max(64, LOOKING.candidates_per_view * count), generator)
+        likelihoods, shown = self.judged(views_of(drawn, *self.resolution, UNITS))
         return drawn[likelihoods.topk(count).indices if likeliest else self.completing(likelihoods, shown, count)]
 
     def completing(self, likelihoods: Tensor, shown: Tensor, count: int) -> list[int]:
@@ -113,7 +109,7 @@ class Candidates:
         coverage = torch.zeros(shown.shape[1], **FLOATS)
         taken: list[int] = []
         for _ in range(min(count, len(likely))):
-            gains = likely * (shown @ (1 / (self.settings.half_gain_coverage + coverage)))
+            gains = likely * (shown @ (1 / (LOOKING.half_gain_coverage + coverage)))
             gains[taken] = -1.0
             taken.append(int(gains.argmax()))
             coverage += shown[taken[-1]]
@@ -123,7 +119,7 @@ class Candidates:
     def _floor(self) -> float:
         """Height below which no camera stands, units."""
         heights = self.few.means[self.targets].double() @ self.up
-        return float(heights.quantile(self.settings.content_quantiles[0]))
+        return float(heights.quantile(0.05))
 
     def _drawn(self, count: int, generator: torch.Generator) -> Tensor:
         """Candidates (V, 4, 4): half of them at random distances from Gaussians, half from likely photo places."""
@@ -135,12 +131,12 @@ class Candidates:
     def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
         """Cameras (count, 4, 4) that look at Gaussians, from where their neighbourhood is as small as in photos, or, if
         that is too far away, from any distance."""
-        settings, aim = self.settings, self._targets(count, generator)
+        aim = self._targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
-        small, large = settings.apparent_sizes
+        small, large = LOOKING.apparent_sizes
         distance = self.widths_around[aim].exp() / (small * (large / small) ** angle)
         distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
-        low, high = settings.pitches
+        low, high = LOOKING.pitches
         pitch = torch.deg2rad(low + (high - low) * pitch)
         ahead = pitch.cos()[:, None] * level_directions(self.up, 2 * math.pi * turn) + pitch.sin()[:, None] * self.up
         target = self.few.means[aim].double()
@@ -152,17 +148,16 @@ class Candidates:
         """Cameras (count, 4, 4) near photo places, which are drawn by their shares. Each looks at one of a few
         Gaussians, the one at the most usual pitch."""
         assert self.places is not None
-        settings = self.settings
         drawn = torch.multinomial(self.places.shares.float(), count, replacement=True, generator=generator)
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
-        eyes = self.places.places[drawn] + settings.photo_place_deviation * offsets
+        eyes = self.places.places[drawn] + LOOKING.photo_place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ self.up).clamp_min(0)[:, None] * self.up
-        aim = self._targets(count * settings.aims, generator).view(count, settings.aims)
+        aim = self._targets(count * LOOKING.aims, generator).view(count, LOOKING.aims)
         targets = self.few.means[aim].double()
         ahead = targets - eyes[:, None]
         rise = (ahead @ self.up) / ahead.norm(dim=2).clamp_min(1e-9)
         pitch = torch.rad2deg(torch.asin(rise.clamp(-1, 1)))
-        usual = (pitch - settings.pitch_mean).abs().argmin(1)
+        usual = (pitch + 10.0).abs().argmin(1)  # photos look down by 10 degrees on average
         return look_at(eyes, targets[torch.arange(count, **INDICES), usual], self.up)
 
     def _targets(self, count: int, generator: torch.Generator) -> Tensor:
@@ -172,8 +167,8 @@ class Candidates:
     def judged(self, views: Views) -> tuple[Tensor, Tensor]:
         """Logarithms (V,) of the likelihood of views in units of the content, up to a constant, float64, and which of
         the Gaussians each shows (V, n), bool."""
-        settings, eyes = self.settings, invert_rigid(views.viewmats.double())[:, :3, 3]
-        views = replace(views.resized(settings.candidate_side), rasterize_mode="antialiased")
+        eyes = invert_rigid(views.viewmats.double())[:, :3, 3]
+        views = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
         likelihoods, shown = [], []
         for eye, pixels in zip(eyes, each_view(self.few, views, pixels_of), strict=True):
             covered = float(pixels.double().sum())
@@ -181,7 +176,7 @@ class Candidates:
             blur = 1.0  # radian, of a view that shows nothing
             if covered > 0:
                 blur = max(float((pixels * self.widths / distances).double().sum()) / covered, MIN_BLUR)
-            shown.append(pixels > settings.min_candidate_pixels)
+            shown.append(pixels > LOOKING.min_candidate_pixels)
             share = (float(shown[-1].sum()) + 1) / len(pixels)
             empty = max(0.0, 1 - covered / (views.width * views.height))
             likelihoods.append(math.log(share) - math.log(empty + MIN_EMPTY) - BLUR_EXPONENT * math.log(blur))

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
@@ -19,15 +18,10 @@ UNITS = 10.0
 against it."""
 
 
-def content_box(scene: Gaussians, settings: LookingSettings = LOOKING) -> tuple[Tensor, Tensor]:
+def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
     """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64.
 
-    Args:
-        scene: N Gaussians.
-        settings: ``content_quantiles``.
-
-    Raises:
-        DataError: if nothing of the scene is visible.
+    Raises DataError if nothing of the scene is visible.
     """
     means, alphas = scene.means.double(), scene.alphas.double()
     visible = scene.usable() & (alphas > 0)
@@ -38,7 +32,7 @@ def content_box(scene: Gaussians, settings: LookingSettings = LOOKING) -> tuple[
     for axis in means.unbind(1):
         ranked, order = axis.sort()
         below = alphas[order].cumsum(0)
-        ends = torch.searchsorted(below, below[-1] * below.new_tensor(settings.content_quantiles))
+        ends = torch.searchsorted(below, below[-1] * below.new_tensor([0.05, 0.95]))
         corners.append(ranked[ends.clamp_max(len(ranked) - 1)])
     low, high = torch.stack(corners, dim=1)
     return low, high

@@ -9,7 +9,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import INDICES
 from pointsplat_ns.views import Views
@@ -23,7 +23,6 @@ def coverage(
     side: int = 160,
     min_pixels: float = 0.05,
     samples: int = 96,
-    settings: LookingSettings = LOOKING,
 ) -> float:
     """Share of the visible content that enough of the views show.
 
@@ -37,7 +36,6 @@ def coverage(
         side: longer side of the pictures in which a Gaussian is shown, pixels.
         min_pixels: smallest sum of its blend weights over the pixels of a picture.
         samples: number of sampled views.
-        settings: ``max_area_quantile``, and those of sampled views.
 
     Returns:
         A share in [0, 1]; 0 if nothing is visible.
@@ -52,13 +50,13 @@ def coverage(
     counts = views_that_show(views)
     visible = counts > 0
     try:
-        visible |= views_that_show(sample_views(scene, samples, seed=96, settings=settings)) > 0
+        visible |= views_that_show(sample_views(scene, samples, seed=96)) > 0
     except DataError:
         pass  # nothing is visible
     stds = scene.stds.double().nan_to_num(0.0, 0.0, 0.0).sort(dim=1).values
     mass = torch.where(visible, scene.alphas.double().nan_to_num(0.0) * stds[:, 1] * stds[:, 2], 0.0)
     if bool(visible.any()):
         ranked = mass[visible].sort().values
-        mass = mass.clamp_max(ranked[int(settings.max_area_quantile * (len(ranked) - 1))])
+        mass = mass.clamp_max(ranked[int(LOOKING.max_area_quantile * (len(ranked) - 1))])
     total = float(mass.sum())
     return float(mass[counts >= times].sum()) / total if total > 0 else 0.0

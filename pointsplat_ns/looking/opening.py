@@ -16,7 +16,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, in_scene_units, views_in_units
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.whole import around, whole_views
 from pointsplat_ns.views import Views
@@ -41,7 +40,6 @@ def opening_views(
     height: int = 600,
     up: Up | None = None,
     known: Views | None = None,
-    settings: LookingSettings = LOOKING,
 ) -> Opening:
     """The views in which to show a scene first.
 
@@ -56,23 +54,22 @@ def opening_views(
         height: of the pictures, pixels.
         up: which way is up; by default what the scene declares, or estimated.
         known: views that people took or chose. Their size, background and rasterize mode apply to all views.
-        settings: tuned numbers.
 
     Raises:
         DataError: if nothing of the scene is visible.
     """
-    sampler = Sampler(scene, (width, height), up, settings)
+    sampler = Sampler(scene, (width, height), up)
     content, candidates = sampler.content, sampler.candidates
     if known is None:
         generator = torch.Generator().manual_seed(0)
-        others = views_of(candidates.views(settings.opening_candidates, generator), width, height, UNITS, settings)
+        others = views_of(candidates.views(24, generator), width, height, UNITS)
     else:
         others, width, height = views_in_units(known, *content), known.width, known.height
 
     def outside(turns: Tensor) -> Views:
-        return whole_views(sampler.surface, sampler.up.direction, turns, settings.opening_elevation, width, height)
+        return whole_views(sampler.surface, sampler.up.direction, turns, 20.0, width, height)
 
-    turns = around(settings.opening_turns)
+    turns = around(12)
     whole_likelihoods, whole_shown = candidates.judged(outside(turns))
     likelihoods, shown = candidates.judged(others)
     best = int(whole_likelihoods.argmax())

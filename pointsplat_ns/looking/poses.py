@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
@@ -41,18 +41,17 @@ def look_at(positions: Tensor, targets: Tensor, up: Tensor | None = None) -> Ten
     return viewmats
 
 
-def views_of(viewmats: Tensor, width: int, height: int, diagonal: float, settings: LookingSettings = LOOKING) -> Views:
+def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> Views:
     """Views over black from world-to-camera matrices.
 
     Args:
         viewmats: (C, 4, 4).
         width, height: size of the pictures, pixels.
-        diagonal: of the content, in the unit of ``viewmats``.
-        settings: ``field_of_view`` and ``near_plane``.
+        diagonal: of the content, in the unit of ``viewmats``; the near plane is a thousandth of it away.
     """
-    focal = 0.5 * max(width, height) / math.tan(math.radians(settings.field_of_view) / 2)
+    focal = 0.5 * max(width, height) / math.tan(math.radians(LOOKING.field_of_view) / 2)
     K = torch.tensor(
         [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype, device="cpu"
     )
     Ks = K.repeat(len(viewmats), 1, 1)
-    return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=settings.near_plane * diagonal)
+    return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=1e-3 * diagonal)

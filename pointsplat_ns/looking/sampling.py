@@ -16,7 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.candidates import Candidates
 from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_scene_units, in_units, thinned, thinning
 from pointsplat_ns.looking.poses import views_of
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, photo_places
@@ -34,7 +34,6 @@ def sample_views(
     height: int = 240,
     seed: int = 0,
     up: Tensor | None = None,
-    settings: LookingSettings = LOOKING,
 ) -> Views:
     """Sample cameras that look at a scene as people may have when they took its photos.
 
@@ -50,7 +49,6 @@ def sample_views(
         seed: the same scene and seed give the same views, another seed gives others.
         up: (3,) direction that is up in the world, of any length; by default the scene's own, or estimated
             (:mod:`pointsplat_ns.looking.upright`).
-        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
 
     Returns:
         ``count`` views, on the CPU, over black: ``viewmats`` (count, 4, 4) from world to camera in OpenCV axes and
@@ -67,7 +65,7 @@ def sample_views(
         >>> len(views), tuple(views.viewmats.shape), (views.width, views.height)
         (3, (3, 4, 4), (64, 48))
     """
-    return Sampler(scene, (width, height), None if up is None else Up(unit_direction(up)), settings).views(count, seed)
+    return Sampler(scene, (width, height), None if up is None else Up(unit_direction(up))).views(count, seed)
 
 
 class Sampler:
@@ -77,7 +75,6 @@ class Sampler:
         scene: N Gaussians. A large one is thinned.
         resolution: width and height of the views, pixels.
         up: which way is up; by default the axis that the scene declares, or estimated.
-        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
 
     Raises:
         DataError: if the resolution is not positive.
@@ -88,18 +85,17 @@ class Sampler:
         scene: Gaussians,
         resolution: tuple[int, int] = RESOLUTION,
         up: Up | None = None,
-        settings: LookingSettings = LOOKING,
     ):
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
-        self.scene = thinned(scene.detach(), settings.sampled_count).to("cpu")  # many small operations
-        self._step = thinning(len(scene), settings.sampled_count)
-        self.resolution, self.settings, self._up = resolution, settings, known_up(up, scene)
+        self.scene = thinned(scene.detach(), LOOKING.sampled_count).to("cpu")  # many small operations
+        self._step = thinning(len(scene), LOOKING.sampled_count)
+        self.resolution, self._up = resolution, known_up(up, scene)
 
     @cached_property
     def content(self) -> tuple[Tensor, float]:
         """Centre (3,) and diagonal of the content, scene units."""
-        return content_size(self.scene, content_box(self.scene, self.settings))
+        return content_size(self.scene, content_box(self.scene))
 
     @cached_property
     def _in_units(self) -> Gaussians:
@@ -108,12 +104,12 @@ class Sampler:
     @cached_property
     def surface(self) -> Surface:
         """The surface of the content, in its units. Raises DataError if nothing is visible."""
-        return Surface.of(self.scene, *self.content, self.settings)
+        return Surface.of(self.scene, *self.content)
 
     @cached_property
     def _traces(self) -> tuple[PhotoEvidence, PhotoPlaces | None]:
         generator = torch.Generator().manual_seed(0)
-        evidence = PhotoEvidence.of(self._in_units, generator, self.settings)
+        evidence = PhotoEvidence.of(self._in_units, generator)
         return evidence, photo_places(evidence, generator)
 
     @property
@@ -134,8 +130,7 @@ class Sampler:
     def candidates(self) -> Candidates:
         """What views are drawn from and judged by. Raises DataError if nothing is visible."""
         evidence, places = self._traces
-        up, resolution = self.up.direction, self.resolution
-        return Candidates.of(self._in_units, self._step, evidence, places, up, resolution, self.settings)
+        return Candidates.of(self._in_units, self._step, evidence, places, self.up.direction, self.resolution)
 
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:
@@ -144,7 +139,7 @@ class Sampler:
         if count < 1:
             raise DataError(f"{count} views asked for; expected at least 1")
         viewmats = self.candidates.views(count, torch.Generator().manual_seed(seed), likeliest)
-        return in_scene_units(views_of(viewmats, *self.resolution, UNITS, self.settings), *self.content)
+        return in_scene_units(views_of(viewmats, *self.resolution, UNITS), *self.content)
 
 
 def unit_direction(up: Tensor) -> Tensor:

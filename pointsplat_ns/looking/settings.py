@@ -1,8 +1,8 @@
-"""The settings of looking: every tuned number, with its meaning and its unit.
+"""The settings of looking: tuned numbers that results depend on, with their meaning and their unit.
 
-A number that only keeps float32 or float64 in range stands beside the formula that needs it. All other numbers are
-here. A field says how its rule is turned off, where it stands for a rule of its own. A unit is a tenth of the diagonal
-of the scene's content, see :data:`~pointsplat_ns.looking.content.UNITS`.
+Numbers that results hardly depend on stand beside their formula. A field says how its rule is turned off, where it
+stands for a rule of its own. A unit is a tenth of the diagonal of the scene's content, see
+:data:`~pointsplat_ns.looking.content.UNITS`. ``lab/judge/ablation.py`` measures what fields are worth.
 """
 
 from __future__ import annotations
@@ -12,18 +12,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LookingSettings:
-    """Settings of :mod:`pointsplat_ns.looking`.
+    """Settings of :mod:`pointsplat_ns.looking`."""
 
-    Example:
-        >>> from dataclasses import replace
-        >>> replace(LOOKING, candidates_per_view=16).aims  # everything as by default, but more candidates
-        4
-    """
-
-    # Content (content.py)
-
-    content_quantiles: tuple[float, float] = (0.05, 0.95)
-    """Quantiles of opacity, or of surface points, along each axis, between which the content lies."""
+    # Outliers (surface.py, traces.py)
 
     outlier_quantiles: tuple[float, float] = (0.02, 0.98)
     """Quantiles of positions beyond which Gaussians or points count as outliers; (0, 1) keeps all."""
@@ -36,9 +27,6 @@ class LookingSettings:
 
     field_of_view: float = 70.0
     """Field of view across the longer side of a sampled view, degrees: that of a phone's main camera."""
-
-    near_plane: float = 1e-3
-    """Near plane of sampled views, as a share of the diagonal of the content."""
 
     # Trace factors (traces.py)
 
@@ -55,15 +43,6 @@ class LookingSettings:
     flatness_exponent_without_sh: float = 2.0
     """Exponent of the mean flatness in scenes without SH; 0 turns it off."""
 
-    min_sh: float = 1e-4
-    """Length of a vector of SH coefficients, root of the sum of squares, up to which it counts as not trained."""
-
-    max_sh: float = 1e3
-    """Bound of the absolute value of an SH coefficient. A colour of 1 is white."""
-
-    max_flatness: float = 7.0
-    """Bound of the flatness, the logarithm of width over thickness: flat Gaussians of any kind are alike."""
-
     max_log_factor: float = 8.0
     """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off."""
 
@@ -72,21 +51,8 @@ class LookingSettings:
     evidence_count: int = 1_500
     """Largest number of Gaussians whose SH are compared with candidate places."""
 
-    evidence_draws: int = 8
-    """Number of Gaussians that are drawn for each of ``evidence_count``, because some have no SH or are faint."""
-
-    size_evidence_factor: int = 4
-    """Number of Gaussians that are compared by size, as a multiple of ``evidence_count``, because one size says less
-    than one vector of SH."""
-
-    candidate_places: int = 1_000
-    """Number of candidate places."""
-
     photo_share_exponent: float = 8
     """Exponent of the evidence of a place in its share."""
-
-    place_box_factor: float = 1.5
-    """Size of the box of candidate places, relative to that of the compared Gaussians without outliers."""
 
     min_sh_evidence: float = 2.0
     """Smallest evidence of the best place by SH, explained energy relative to SH of random directions, for photo places
@@ -101,9 +67,6 @@ class LookingSettings:
 
     # Surface points (surface.py)
 
-    surface_points: int = 12_288
-    """Number of points that are drawn from a scene."""
-
     min_opacity: float = 0.1
     """Smallest opacity of the Gaussians that points are drawn from, if there are any, and of those that are compared
     with candidate places: a haze hides nothing; 0 turns the rule off."""
@@ -112,31 +75,7 @@ class LookingSettings:
     """Exponent of opacity times area in the chance of a Gaussian to get a point. 0 counts Gaussians, which are many
     where photos show detail; 1 counts their area. 1 loses 0.2 to 0.3 dB in two of four scenes and gains 0.1 in one."""
 
-    max_surface_offset: float = 1.5
-    """Bound of the distance of a point from the centre of its Gaussian along each axis, standard deviations."""
-
     # Up (upright.py)
-
-    content_radius: float = 6.0
-    """Radius, around the centre of the content, within which points belong to the content, units."""
-
-    upright_points: int = 4_096
-    """Largest number of surface points from which up is estimated."""
-
-    upright_directions: int = 400
-    """Number of directions that are tried, evenly over half of a sphere: about 7 degrees apart."""
-
-    refined_directions: int = 8
-    """Number of the best directions that are refined."""
-
-    refining_angles: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
-    """Angles by which the best directions are turned, step by step, degrees."""
-
-    normal_deviation: float = 8.0
-    """Standard deviation of the angle within which a surface counts as level or vertical, degrees."""
-
-    slab_thickness: float = 0.1
-    """Thickness of the slabs in which points are counted by height, units; two neighbours hold one level surface."""
 
     usual_axis_factors: tuple[float, float] = (1.32, 1.25)
     """Factor of the uprightness of the world's axes, as most files stand along one, and a further one of y, as most
@@ -153,39 +92,6 @@ class LookingSettings:
     seen from below, for it to decide between a direction and its opposite; infinity turns the rule off. People
     photograph from above, and floors hide what is below them. The ratio is right in all of 27 captures and splats, most
     narrowly for a robot over a meadow (0.106), and wrong in a closed synthetic room (0.23)."""
-
-    seen_from_above_turns: int = 6
-    """Number of cameras around the content, above it and below it."""
-
-    seen_from_above_elevation: float = 30.0
-    """Elevation of these cameras, degrees."""
-
-    # Cameras that show the whole, and the views of an opening (whole.py, opening.py)
-
-    whole_quantiles: tuple[float, float] = (0.005, 0.995)
-    """Quantiles of the surface points between which the whole subject lies."""
-
-    whole_shares: tuple[float, float] = (0.92, 0.88)
-    """Largest shares of the width and of the height of a picture that the subject takes."""
-
-    min_shown_pixels: float = 0.1
-    """Smallest sum of blend weights over the pixels of a picture that counts what is shown, for it to show a Gaussian,
-    pixels."""
-
-    pictured_count: int = 20_000
-    """Largest number of Gaussians in the pictures that count what is shown."""
-
-    pictured_side: int = 128
-    """Longer side of these pictures, pixels."""
-
-    opening_turns: int = 12
-    """Number of cameras around the content that compete to be the first."""
-
-    opening_elevation: float = 20.0
-    """Elevation of the cameras around the content, degrees."""
-
-    opening_candidates: int = 24
-    """Number of sampled views that compete with them."""
 
     # Candidate views (candidates.py)
 
@@ -204,23 +110,14 @@ class LookingSettings:
     candidates_per_view: int = 8
     """Number of candidates for each view."""
 
-    min_candidates: int = 64
-    """Smallest number of candidates."""
-
     half_gain_coverage: float = 0.5
     """Number of views that show a Gaussian at which one more counts a half."""
 
     apparent_sizes: tuple[float, float] = (0.0015, 0.0175)
     """Angles that the Gaussians around the one in the middle subtend, radians: 2 to 24 pixels of 1920."""
 
-    width_neighbours: int = 9
-    """Number of Gaussians along a space-filling curve that count as around one, odd."""
-
     pitches: tuple[float, float] = (-50.0, 10.0)
     """Lowest and highest pitch of a camera that looks at a Gaussian from any side, degrees; above 0 is up."""
-
-    pitch_mean: float = -10.0
-    """Usual pitch of photos, degrees."""
 
     photo_place_deviation: float = 0.15
     """Standard deviation of candidates from photo places along each axis, units."""
@@ -233,12 +130,6 @@ class LookingSettings:
     smallest_side: int = 320
     """Longer side of the smallest picture, and of subsampled ones, pixels."""
 
-    # Views to optimise on (view_source.py)
-
-    opposite_background_every: int = 5
-    """Of the sampled views of a scene without known views, one of this many has the opposite background, because nobody
-    knows before which one the scene is shown; 0 turns the rule off."""
-
 
 LOOKING = LookingSettings()
-"""Default settings of sampling and choosing views."""
+"""The settings in use."""

@@ -17,7 +17,7 @@ import torch
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.views import Views
 
@@ -48,27 +48,27 @@ def size_text(resolution: tuple[int, int]) -> str:
     return "x".join(map(str, resolution))
 
 
-def sides_of(width: int, height: int, settings: LookingSettings = LOOKING) -> tuple[int, ...]:
-    """Longer sides of the pictures that renders are compared in, pixels: ``smallest_side`` of the settings, the whole
+def sides_of(width: int, height: int) -> tuple[int, ...]:
+    """Longer sides of the pictures that renders are compared in, pixels: ``LOOKING.smallest_side``, the whole
     size, and their geometric mean. The whole size alone if it is no larger than the smallest.
 
     Example:
         >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
         ((320, 784, 1920), (320, 416, 540), (64,))
     """
-    longest, smallest = max(width, height), settings.smallest_side
+    longest, smallest = max(width, height), LOOKING.smallest_side
     return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
 
 
-def middle_side(views: Views, settings: LookingSettings = LOOKING) -> int:
+def middle_side(views: Views) -> int:
     """The middle one of the :func:`sides_of` views, pixels."""
-    sides = sides_of(views.width, views.height, settings)
+    sides = sides_of(views.width, views.height)
     return sides[len(sides) // 2]
 
 
-def middle_sized(views: Views, settings: LookingSettings = LOOKING) -> Views:
+def middle_sized(views: Views) -> Views:
     """Views at their :func:`middle_side`: nearly as large as people look at, and quick to draw."""
-    return views.resized(middle_side(views, settings))
+    return views.resized(middle_side(views))
 
 
 def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
@@ -79,16 +79,16 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
         side: longer side of the whole pictures, pixels. If it is larger than the views' own, the pictures are as large
             as those of a camera that is nearer.
         drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default ``side``, and at most
-            ``smallest_side`` of the settings.
+            ``LOOKING.smallest_side``.
     """
     drawn = views.resized(min(side, LOOKING.smallest_side) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
-def two_sizes(views: Views, settings: LookingSettings = LOOKING) -> tuple[Views, Views]:
+def two_sizes(views: Views) -> tuple[Views, Views]:
     """Views to optimise on, of two sizes: subsampled from pictures of their :func:`middle_side`, and from whole ones.
     Drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
-    return subsampled(views, middle_side(views, settings)), subsampled(views, max(views.width, views.height))
+    return subsampled(views, middle_side(views)), subsampled(views, max(views.width, views.height))
 
 
 class RendersOfSizes:

@@ -24,10 +24,16 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+
+MIN_SH = 1e-4
+"""Length of a vector of SH coefficients, root of the sum of squares, up to which it counts as not trained."""
+
+MAX_SH = 1e3
+"""Bound of the absolute value of an SH coefficient. A colour of 1 is white."""
 
 
 class PhotoPlaces(NamedTuple):
@@ -39,7 +45,7 @@ class PhotoPlaces(NamedTuple):
     """Whether the best place explains enough for photos to have been taken there."""
 
 
-def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
+def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
     """Trace factor of each member: large where photos showed its neighbourhood well, 1 for the median member.
 
     The mean energy of the SH and the exponential of the mean flatness, each to a power. The flatness is the logarithm
@@ -48,32 +54,31 @@ def trace_factors(scene: Gaussians, members: Tensor, settings: LookingSettings =
     Args:
         scene: N Gaussians.
         members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
-        settings: ``trace_neighbourhood``, ``max_log_factor``, the exponents and the bounds of SH and flatness.
 
     Returns:
         (n,) float32; 1 for all if the Gaussians have no SH and are equally flat.
     """
 
     def local_means(values: Tensor) -> Tensor:
-        return means_around(values, settings.trace_neighbourhood)
+        return means_around(values, LOOKING.trace_neighbourhood)
 
-    energy = local_means(in_pieces(lambda rows: _energy(scene.features_rest[rows].double(), settings), members))
-    flatness = local_means(in_pieces(lambda rows: _flatness(scene.scales[rows].double(), settings), members))
+    energy = local_means(in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members))
+    flatness = local_means(in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members))
     has_sh = bool((energy > 0).any())
-    exponent = settings.flatness_exponent if has_sh else settings.flatness_exponent_without_sh
-    logs = settings.energy_exponent * (energy + settings.min_sh**2).log() + exponent * flatness
-    return (logs - logs.median()).clamp(-settings.max_log_factor, settings.max_log_factor).exp().float()
+    exponent = LOOKING.flatness_exponent if has_sh else LOOKING.flatness_exponent_without_sh
+    logs = LOOKING.energy_exponent * (energy + MIN_SH**2).log() + exponent * flatness
+    return (logs - logs.median()).clamp(-LOOKING.max_log_factor, LOOKING.max_log_factor).exp().float()
 
 
-def _energy(sh: Tensor, settings: LookingSettings) -> Tensor:
+def _energy(sh: Tensor) -> Tensor:
     """Sums of squares (n,) of SH coefficients (n, K, 3)."""
-    return sh.clamp(-settings.max_sh, settings.max_sh).square().sum((1, 2))
+    return sh.clamp(-MAX_SH, MAX_SH).square().sum((1, 2))
 
 
-def _flatness(scales: Tensor, settings: LookingSettings) -> Tensor:
+def _flatness(scales: Tensor) -> Tensor:
     """Logarithms (n,) of width over thickness of log-scales (n, 3)."""
     thickness, width, length = scales.sort(dim=1).values.unbind(1)
-    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, settings.max_flatness)
+    return (0.5 * (width + length) - thickness).nan_to_num(0.0).clamp(0.0, 7.0)  # flat ones of any kind are alike
 
 
 def means_around(values: Tensor, count: int) -> Tensor:
@@ -89,22 +94,22 @@ class PhotoEvidence:
     means: Tensor  # [n, 3] float64, scene units
     sh: Tensor  # [n, K, 3] float32, SH coefficients of degrees 1 and up, of length 1
     sizes: Tensor  # [n] float64, logarithms of the geometric means of width and length
-    settings: LookingSettings = LOOKING
 
     @staticmethod
-    def of(scene: Gaussians, generator: torch.Generator, settings: LookingSettings = LOOKING) -> PhotoEvidence:
-        """Gaussians that are drawn from those with SH; if there are none, from all that are opaque enough."""
-        count = settings.evidence_count
-        drawn = torch.randperm(len(scene), generator=generator, device="cpu")[: settings.evidence_draws * count]
+    def of(scene: Gaussians, generator: torch.Generator) -> PhotoEvidence:
+        """Gaussians that are drawn from those with SH; if there are none, from all that are opaque enough: four times
+        as many, because one size says less than one vector of SH."""
+        count = LOOKING.evidence_count
+        drawn = torch.randperm(len(scene), generator=generator, device="cpu")[: 8 * count]  # some are faint
         some = scene[drawn.to(scene.device)].to("cpu")
-        sh = unit_sh(some.features_rest, settings)
-        opaque = some.usable() & (some.alphas > settings.min_opacity)
+        sh = unit_sh(some.features_rest)
+        opaque = some.usable() & (some.alphas > LOOKING.min_opacity)
         with_sh = opaque & (sh != 0).any(2).any(1)
         if bool(with_sh.any()):
             chosen = with_sh.nonzero()[:count, 0]
         else:
-            chosen = opaque.nonzero()[: settings.size_evidence_factor * count, 0]
-        return PhotoEvidence(some.means[chosen].double(), sh[chosen], log_widths(some.scales[chosen]), settings)
+            chosen = opaque.nonzero()[: 4 * count, 0]
+        return PhotoEvidence(some.means[chosen].double(), sh[chosen], log_widths(some.scales[chosen]))
 
     @property
     def has_sh(self) -> bool:
@@ -112,10 +117,10 @@ class PhotoEvidence:
         return bool((self.sh != 0).any())
 
     def candidates(self, count: int, generator: torch.Generator) -> Tensor:
-        """Candidate places (count, 3), drawn evenly from a box around the Gaussians, float64."""
-        low, high = torch.quantile(self.means, self.means.new_tensor(self.settings.outlier_quantiles), dim=0)
+        """Candidate places (count, 3), drawn evenly from a box 1.5 times that of the Gaussians, float64."""
+        low, high = torch.quantile(self.means, self.means.new_tensor(LOOKING.outlier_quantiles), dim=0)
         offsets = torch.rand(count, 3, generator=generator, **FLOATS).double() - 0.5
-        return 0.5 * (low + high) + self.settings.place_box_factor * (high - low) * offsets
+        return 0.5 * (low + high) + 1.5 * (high - low) * offsets
 
     def at(self, places: Tensor) -> Tensor:
         """Evidence for each place (P, 3), (P,) float32.
@@ -123,9 +128,7 @@ class PhotoEvidence:
         Mean of the :func:`explained_energy`; without SH, the correlation of the logarithms of size and distance.
         """
         if self.has_sh:
-            return torch.stack(
-                [explained_energy(self.means - place, self.sh, self.settings).mean() for place in places]
-            )
+            return torch.stack([explained_energy(self.means - place, self.sh).mean() for place in places])
         return torch.stack([correlation(log_norms(self.means - place), self.sizes) for place in places]).float()
 
     def towards(self, directions: Tensor) -> Tensor:
@@ -146,21 +149,20 @@ def photo_places(evidence: PhotoEvidence, generator: torch.Generator) -> PhotoPl
     """
     if len(evidence.means) == 0:
         return None
-    settings = evidence.settings
-    places = evidence.candidates(settings.candidate_places, generator)
+    places = evidence.candidates(1_000, generator)
     found = evidence.at(places)
     best = float(found.max())
-    shares = (found.clamp_min(0) / max(best, 1e-9)) ** settings.photo_share_exponent + 1e-12
-    needed = settings.min_sh_evidence if evidence.has_sh else settings.min_size_evidence
+    shares = (found.clamp_min(0) / max(best, 1e-9)) ** LOOKING.photo_share_exponent + 1e-12
+    needed = LOOKING.min_sh_evidence if evidence.has_sh else LOOKING.min_size_evidence
     return PhotoPlaces(places, shares / shares.sum(), sure=best >= needed)
 
 
-def unit_sh(sh: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
+def unit_sh(sh: Tensor) -> Tensor:
     """SH coefficients (n, K, 3), scaled to a length of 1 for each Gaussian, float32; 0 if they are at most
-    ``min_sh`` long."""
-    sh = sh.double().clamp(-settings.max_sh, settings.max_sh)
-    length = _energy(sh, settings).sqrt()[:, None, None]
-    return torch.where(length > settings.min_sh, sh / length.clamp_min(settings.min_sh), 0.0).float()
+    :data:`MIN_SH` long."""
+    sh = sh.double().clamp(-MAX_SH, MAX_SH)
+    length = _energy(sh).sqrt()[:, None, None]
+    return torch.where(length > MIN_SH, sh / length.clamp_min(MIN_SH), 0.0).float()
 
 
 def log_widths(scales: Tensor) -> Tensor:
@@ -179,19 +181,18 @@ def correlation(a: Tensor, b: Tensor) -> Tensor:
     return torch.corrcoef(torch.stack([a, b]))[0, 1].nan_to_num(0.0)
 
 
-def explained_energy(offsets: Tensor, sh: Tensor, settings: LookingSettings = LOOKING) -> Tensor:
+def explained_energy(offsets: Tensor, sh: Tensor) -> Tensor:
     """Share of the energy of SH that lies along the basis in one direction each, relative to its mean over SH of random
     directions.
 
     Args:
         offsets: (n, 3) from an eye to Gaussians, of any length.
         sh: (n, K, 3) SH coefficients of degrees 1 and up, of length 1.
-        settings: ``min_sh``.
 
     Returns:
         (n,) float32 in [0, K]: large if photos were taken from that direction.
     """
     directions = (offsets / offsets.norm(dim=1, keepdim=True).clamp_min(torch.finfo(offsets.dtype).tiny)).float()
     basis = sh_basis(directions, math.isqrt(sh.shape[1] + 1) - 1)[:, 1:]
-    along = (sh * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(settings.min_sh)
+    along = (sh * basis[:, :, None]).sum(1).square().sum(1) / basis.square().sum(1).clamp_min(MIN_SH)
     return along * sh.shape[1]

@@ -17,9 +17,13 @@ from torch import Tensor
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import AXES, axis_along, direction_of
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoEvidence
 from pointsplat_ns.system.tensors import DOUBLES
+
+CONTENT_RADIUS = 6.0
+"""Distance from the centre of the content within which points belong to it, units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,30 +91,31 @@ def upright_axis(surface: Surface, evidence: PhotoEvidence | None = None) -> Ten
     best of the three.
 
     Args:
-        surface: points of the scene, and the settings.
+        surface: points of the scene.
         evidence: Gaussians that tell from which directions photos were taken, if they do.
     """
-    content, settings = _content(surface), surface.settings
+    content = _content(surface)
 
     def scores_of(axes: Tensor) -> Tensor:
         scores = uprightness(axes, content)
         if evidence is None:
             return scores
         photographed_along = 0.5 * (evidence.towards(axes) + evidence.towards(-axes))
-        return scores + settings.photo_direction_weight * (1 - photographed_along)
+        return scores + LOOKING.photo_direction_weight * (1 - photographed_along)
 
-    index = torch.arange(settings.upright_directions, **DOUBLES) + 0.5
-    height = 1 - index / settings.upright_directions  # Fibonacci's spiral
+    directions, refined = 400, 8  # about 7 degrees apart, and how many of the best are refined
+    index = torch.arange(directions, **DOUBLES) + 0.5
+    height = 1 - index / directions  # Fibonacci's spiral
     turn = index * math.pi * (3 - math.sqrt(5))
     ring = (1 - height.square()).sqrt()
     around = torch.stack([ring * turn.cos(), ring * turn.sin(), height], dim=1)
     scores = scores_of(around)
-    found = around[scores.topk(settings.refined_directions).indices]
-    for degrees in settings.refining_angles:
+    found = around[scores.topk(refined).indices]
+    for degrees in (4.0, 2.0, 1.0, 0.5):
         found = torch.cat([found, _nearby(found, math.radians(degrees))])
         scores = scores_of(found)
-        found = found[scores.topk(settings.refined_directions).indices]
-    of_world, of_y = settings.usual_axis_factors if evidence is None else (1.05, 1.0)
+        found = found[scores.topk(refined).indices]
+    of_world, of_y = LOOKING.usual_axis_factors if evidence is None else (1.05, 1.0)
     world = torch.eye(3, **DOUBLES)
     world_scores = world.new_tensor([of_world, of_world * of_y, of_world]) * scores_of(world)
     return world[world_scores.argmax()] if bool(world_scores.max() >= scores.max()) else found[0]
@@ -123,21 +128,20 @@ def pointing_up(surface: Surface, axis: Tensor, from_above: float = 0.0) -> Up:
     of their first camera.
 
     Args:
-        surface: points of the scene, and the settings.
+        surface: points of the scene.
         axis: (3,) as :func:`upright_axis` gives it.
         from_above: as :func:`~pointsplat_ns.looking.whole.seen_from_above` gives it for ``axis``.
     """
-    settings = surface.settings
-    clear = abs(from_above) >= settings.min_seen_from_above
+    clear = abs(from_above) >= LOOKING.min_seen_from_above
     sign = 1 if (from_above if clear else _usual(axis)) >= 0 else -1
     return Up(sign * axis, clear)
 
 
 def _content(surface: Surface) -> Surface:
     """Some of the points near the content; of all points if none is near."""
-    near = surface.points.norm(dim=1) < surface.settings.content_radius
+    near = surface.points.norm(dim=1) < CONTENT_RADIUS
     near = near if bool(near.any()) else torch.ones_like(near)
-    return surface[near.nonzero()[: surface.settings.upright_points, 0]]
+    return surface[near.nonzero()[:4096, 0]]
 
 
 def uprightness(axes: Tensor, content: Surface) -> Tensor:
@@ -146,15 +150,14 @@ def uprightness(axes: Tensor, content: Surface) -> Tensor:
     It is the share of level surfaces plus the share of vertical ones, less their mean over random directions, plus the
     largest share of points in one thin level slab.
     """
-    deviation, radius = content.settings.normal_deviation, content.settings.content_radius
+    deviation, thickness = 8.0, 0.1  # of a normal that counts, degrees; of a slab, units
     weights = content.flatness / content.flatness.sum().clamp_min(1e-300)
     tilt = torch.rad2deg(torch.asin((axes @ content.normals.T).abs().clamp_max(1)))  # [D, n] 90 where level
     level, vertical = ((-0.5 * (angle / deviation).square()).exp() for angle in (90 - tilt, tilt))
     even = torch.rad2deg(torch.asin((torch.arange(1000, **DOUBLES) + 0.5) / 1000))
     chance = sum(float((-0.5 * (angle / deviation).square()).exp().mean()) for angle in (90 - even, even))
-    thickness = content.settings.slab_thickness
-    slabs = round(2 * radius / thickness)
-    slab = ((axes @ content.points.T + radius) / thickness).long().clamp(0, slabs - 1)
+    slabs = round(2 * CONTENT_RADIUS / thickness)
+    slab = ((axes @ content.points.T + CONTENT_RADIUS) / thickness).long().clamp(0, slabs - 1)
     counts = torch.zeros(len(axes), slabs, **DOUBLES)
     counts.scatter_add_(1, slab, torch.ones_like(slab, dtype=torch.float64))
     thickest = (counts[:, 1:] + counts[:, :-1]).amax(1) / len(content.points)

@@ -14,7 +14,6 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.settings import LOOKING, LookingSettings
 from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.views import View, Views, spread_indices
@@ -52,7 +51,6 @@ class ViewSource:
         dataset_views: function that reads the poses of a run's dataset.
         resolution: width and height, pixels, of the pictures that people look at. By default given views and photos
             have their own, and sampled views 1920 x 1080.
-        settings: tuned numbers, see :mod:`pointsplat_ns.looking.settings`.
         up: which way is up, for sampled views; by default what the scene declares, or estimated.
     """
 
@@ -63,10 +61,9 @@ class ViewSource:
         run: Path | str | None = None,
         dataset_views: Callable[[Path | str], Views] | None = None,
         resolution: tuple[int, int] | None = None,
-        settings: LookingSettings = LOOKING,
         up: Up | None = None,
     ):
-        self._resolution, self._settings, self._up = resolution, settings, up
+        self._resolution, self._up = resolution, up
         self._scene, self._given, self._run, self._dataset_views = scene, given, run, dataset_views
         self.origin = ""
         """Text that says where views came from; empty until there are some."""
@@ -123,7 +120,7 @@ class ViewSource:
     @cached_property
     def sampler(self) -> Sampler:
         """The sampler of the scene."""
-        return Sampler(self._scene, self.resolution, self._up, self._settings)
+        return Sampler(self._scene, self.resolution, self._up)
 
     @property
     def up(self) -> Up:
@@ -162,11 +159,11 @@ class ViewSource:
 
     def compared(self) -> Views:
         """The views in which renders are compared, at :func:`~pointsplat_ns.looking.sizes.middle_sized` size."""
-        return middle_sized(self._whole, self._settings)
+        return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
         """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
-        return middle_sized(self.views(count), self._settings)
+        return middle_sized(self.views(count))
 
     def others(self, seed: int = 0) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
@@ -214,14 +211,13 @@ class ViewSource:
             background=compared.background,
             rasterize_mode=compared.rasterize_mode,
         )
-        every = self._settings.opposite_background_every
         for turn, view in enumerate(self._in_turn(views, seed)):
-            opposite = self._known is None and every > 0 and turn % every == every - 1
+            opposite = self._known is None and turn % 5 == 4  # the viewer's background is unknown
             yield dataclasses.replace(view, background=1 - view.background) if opposite else view
 
     def _in_turn(self, views: Views, seed: int) -> Iterator[View]:
         """Views in random order, each once before any is repeated, then of the other size; without end."""
-        sizes, generator = two_sizes(views, self._settings), random.Random(seed)
+        sizes, generator = two_sizes(views), random.Random(seed)
         for lap in counted():
             for index in generator.sample(range(len(views)), len(views)):
                 yield sizes[(lap + index) % 2][index]

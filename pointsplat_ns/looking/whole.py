@@ -13,6 +13,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, in_units, thinned
 from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
@@ -36,20 +37,20 @@ def whole_views(
     Returns:
         n views, float64, units.
     """
-    settings, points = surface.settings, surface.points
+    points = surface.points
     level = torch.stack([*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up])  # [3, 3] rows
-    quantiles = points.new_tensor(settings.whole_quantiles)
+    quantiles = points.new_tensor([0.005, 0.995])  # what lies beyond is no part of the subject
     middle = (points @ level.T).quantile(quantiles, dim=0).mean(0) @ level
     lift = math.radians(elevation)
     sides = math.cos(lift) * level_directions(up, turns.to(up)) + math.sin(lift) * up
     viewmats = look_at(sides, torch.zeros_like(sides), up)
     x, y, z = (viewmats[:, :3, :3] @ (points - middle).T).unbind(1)  # [n, M]
-    reach = math.tan(math.radians(settings.field_of_view) / 2) / max(width, height)
-    across, along = settings.whole_shares
+    reach = math.tan(math.radians(LOOKING.field_of_view) / 2) / max(width, height)
+    across, along = 0.92, 0.88  # largest shares of the picture's width and height that the subject takes
     needed = torch.maximum(x.abs() / (across * width * reach), y.abs() / (along * height * reach)) - z
     distances = needed.quantile(quantiles[1], dim=1).clamp_min(0.1)
     viewmats = look_at(middle + distances[:, None] * sides, middle.expand_as(sides), up)
-    return views_of(viewmats, width, height, UNITS, settings)
+    return views_of(viewmats, width, height, UNITS)
 
 
 def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: Surface, axis: Tensor) -> float:
@@ -60,15 +61,14 @@ def seen_from_above(scene: Gaussians, centre: Tensor, diagonal: float, surface: 
         scene: N Gaussians on the CPU.
         centre: (3,) of its content.
         diagonal: of its content, scene units.
-        surface: points of the scene, and the settings.
+        surface: points of the scene.
         axis: (3,) of length 1.
     """
-    settings, turns = surface.settings, around(surface.settings.seen_from_above_turns)
-    few = in_units(thinned(scene, settings.pictured_count), centre, diagonal)
+    few = in_units(thinned(scene, 20_000), centre, diagonal)
 
     def most(up: Tensor) -> int:
-        views = whole_views(surface, up, turns, settings.seen_from_above_elevation).resized(settings.pictured_side)
-        return max(int((pixels_of(few, view) > settings.min_shown_pixels).sum()) for view in views)
+        views = whole_views(surface, up, around(6), 30.0).resized(128)
+        return max(int((pixels_of(few, view) > 0.1).sum()) for view in views)
 
     return math.log((most(axis) + 1) / (most(-axis) + 1))
 

@@ -36,7 +36,7 @@ def wall(count: int = 3000, size: float = 0.06) -> Gaussians:
 def candidates(scene: Gaussians, step: int = 1) -> Candidates:
     generator = torch.Generator().manual_seed(0)
     evidence = PhotoEvidence.of(scene, generator)
-    return Candidates.of(scene, step, evidence, None, UP, (640, 360), LOOKING)
+    return Candidates.of(scene, step, evidence, None, UP, (640, 360))
 
 
 def seen_from(*eyes: tuple[float, float, float]):

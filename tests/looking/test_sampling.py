@@ -10,6 +10,7 @@ from upright_scenes import TURNS, room, tower, turned
 from making import box_room
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking import sampling
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
@@ -163,8 +164,10 @@ def test_a_view_that_a_few_large_gaussians_fill_is_not_taken(make_hollow_ball):
     assert len(views) >= 1 and max(subtended) < 0.2
 
 
-def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it():
+def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it(monkeypatch):
     scene = box_room(0, 3000)
-    few = Sampler(scene, (64, 48), settings=dataclasses.replace(LOOKING, sampled_count=700))
+    whole = Sampler(scene).content
+    monkeypatch.setattr(sampling, "LOOKING", dataclasses.replace(LOOKING, sampled_count=700))
+    few = Sampler(scene, (64, 48))
     assert len(few.scene) == 750 and len(few.views(3)) == 3
-    assert few.content[1] == pytest.approx(Sampler(scene).content[1], rel=0.05)
+    assert few.content[1] == pytest.approx(whole[1], rel=0.05)
