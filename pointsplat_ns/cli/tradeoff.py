@@ -58,7 +58,7 @@ def tradeoff(
         within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
             renders.
         by: methods of prune; a search for targets uses the first one.
-        sh: SH degrees: all bands, or those up to a degree; a search for targets chooses the degree.
+        sh: SH degrees to measure: all bands, or those up to a degree.
         repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;

@@ -71,7 +71,7 @@ def measure_tradeoff(
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
             expected of its renders (:mod:`~pointsplat_ns.tradeoff.front`).
         by: methods, as for :func:`pointsplat_ns.prune`; a search uses the first one.
-        sh: SH degrees: "all" for all bands, a digit for those up to a degree. A search chooses the degree.
+        sh: SH degrees: "all" for all bands, a digit for those up to a degree.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and
             "photos", its training on the photos of a run.
         views: largest number of views; without photos at most 12.
@@ -108,7 +108,7 @@ def measure_tradeoff(
     """
     options = SweepOptions(KEEP if keep is None else tuple(keep), tuple(by), tuple(sh), tuple(repairs), within, views)
     on_photos = "photos" in options.repairs
-    targets = targets_of(target_db, target_ms, target_mb, keep, photos=on_photos)
+    targets = targets_of(target_db, target_ms, target_mb, keep, " ".join(sh), photos=on_photos)
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
     with claimed_folder(folder), progress_bar(progress) as report:
