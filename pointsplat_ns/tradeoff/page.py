@@ -7,7 +7,7 @@ import functools
 import json
 import math
 from collections.abc import Callable
-from itertools import count, product, takewhile
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, get_args
 
@@ -114,65 +114,24 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Callable[[], np.n
 
 def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     """Values for the template itself, without scripts."""
-    columns = _columns(sweep)
 
-    def cells(point: Point) -> list[tuple[float | str, str]]:
-        return [(_number(value(point)), text(value(point))) for _, value, text in columns]
+    def measured(reference: Reference, metric: Metric) -> bool:
+        return any(metric_of(point, reference, metric) is not None for point in sweep.points)
 
     return {
         "sweep": sweep,
         "views": views,
-        "references": [name for name in REFERENCES if _measured(sweep, name, "psnr")],
-        "metrics": [name for name in METRICS if _measured(sweep, "renders", name)],
-        "titles": [title for title, _, _ in columns],
-        "rows": [(point, cells(point)) for point in sweep.points],
+        "references": [name for name in REFERENCES if measured(name, "psnr")],
+        "metrics": [name for name in METRICS if measured("renders", name)],
+        "speed_of": speed_of,
+        "metric_of": metric_of,
+        "three_digits": three_digits,
+        "infinity": math.inf,
         "amplified": ERROR_GAIN,
         "full_level": math.ceil(255 / ERROR_GAIN),
         "above_db": round(psnr_within(sweep.within), 1),
         "ramp": ["#" + bytes(color).hex() for color in error_colors()[::17].tolist()],
     }
-
-
-def _measured(sweep: Tradeoff, reference: Reference, metric: Metric) -> bool:
-    return any(metric_of(point, reference, metric) is not None for point in sweep.points)
-
-
-def _columns(sweep: Tradeoff) -> list[tuple[str, Callable[[Point], Any], Callable[[Any], str]]]:
-    """The columns of the table: title, value of a point, and text of a value."""
-    dense, names = sweep.points[0], {"psnr": "PSNR dB", "ssim": "SSIM", "lpips": "LPIPS"}
-
-    def digits(number: int) -> Callable[[float | None], str]:
-        return lambda value: "–" if value is None else "identical" if value == math.inf else f"{value:,.{number}f}"
-
-    return [
-        ("kept", lambda point: point.share, lambda share: f"{100 * share:.3g} %"),
-        ("Gaussians", lambda point: point.gaussians, digits(0)),
-        ("SH", lambda point: point.sh_degree, str),
-        ("MB", lambda point: point.bytes / 1e6, three_digits),
-        (
-            "times as fast",
-            lambda point: speed_of(point, dense),
-            lambda speed: f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})",
-        ),
-        ("ms a frame", lambda point: point.frame_ms, lambda ms: f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"),
-        ("fill", lambda point: point.fill, digits(1)),
-        *(
-            (
-                f"{names[metric]}, {reference}",
-                functools.partial(metric_of, reference=reference, metric=metric),
-                digits(2 if metric == "psnr" else 3),
-            )
-            for reference, metric in product(REFERENCES, METRICS)
-            if _measured(sweep, reference, metric)
-        ),
-        ("made in, s", lambda point: point.seconds, digits(1)),
-        ("peak memory, GB", lambda point: None if point.peak_bytes is None else point.peak_bytes / 1e9, digits(2)),
-    ]
-
-
-def _number(value: Any) -> float | str:
-    """The number that a value is sorted by; empty if it is not known."""
-    return "" if value is None else value[0] if isinstance(value, tuple) else value
 
 
 def _data(sweep: Tradeoff) -> dict[str, Any]:

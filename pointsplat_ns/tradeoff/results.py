@@ -14,6 +14,7 @@ from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import one_line, read_text, write_json
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Speed, Tradeoff, restored_point, speed_of
+from pointsplat_ns.tradeoff.settings import Setting, setting_of
 
 VERSION = 4
 """Version of the JSON. Points of version 1 were timed without the dense scene beside them, some of version 2 drawn in
@@ -69,18 +70,19 @@ def _rows(sweep: Tradeoff) -> list[dict[str, Any]]:
     return [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
 
 
-def read_points(folder: Path, identity: Mapping[str, str | int]) -> list[Point]:
-    """The points of an earlier call, whose file is not trusted; none if there is no file. Raises SceneError if it is
-    damaged or of another version, or its points are of another identity."""
+def read_points(folder: Path, identity: Mapping[str, str | int]) -> dict[Setting, Point]:
+    """The points of an earlier call by setting. The file is not trusted; there are none if there is no file. Raises
+    SceneError if it is damaged or of another version, or its points are of another identity."""
     path, mend = folder / SWEEP_FILES.json, "name another folder, or start over with --force"
     if not path.exists():
-        return []
+        return {}
     try:
         content = json.loads(read_text(path, 16_000_000))  # a thousand points take one megabyte
         if content["version"] != VERSION:
             raise ValueError(f"of version {content['version']!r:.20}, this program's are of {VERSION}")
         of, rows = dict(content["of"]), content["points"]
         points = [restored_point({name: row[name] for name in row if name != "speed"}) for row in rows]
+        found = {setting_of(point): point for point in points}
     except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError, PointSplatError) as error:
         why = f"lacks {error}" if isinstance(error, KeyError) else one_line(error, 80)
         raise SceneError(f"{path}: not the points of a sweep ({why}); {mend}") from error
@@ -89,4 +91,4 @@ def read_points(folder: Path, identity: Mapping[str, str | int]) -> list[Point]:
             raise SceneError(
                 f"{path}: its points are of another sweep ({name}: {of.get(name)!r}, now {value!r}); {mend}"
             )
-    return points
+    return found

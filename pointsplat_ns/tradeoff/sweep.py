@@ -27,7 +27,7 @@ from pointsplat_ns.tradeoff.machine import busy_note, machine_text
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path
 from pointsplat_ns.tradeoff.results import SWEEP_FILES, read_points, write_points, write_table
-from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting, check_repairs, setting_of, whole_of
+from pointsplat_ns.tradeoff.settings import DENSE, REPAIRS, Setting, check_repairs, whole_of
 from pointsplat_ns.views import spread_indices
 
 logger = logging.getLogger("pointsplat_ns")
@@ -120,14 +120,15 @@ class Sweep:
             # Sampled ones may differ by rounding.
             "cameras": "" if subject.new_views().given is None else hashlib.sha256(cameras).hexdigest()[:16],
         }
-        self.points: dict[Setting, Point] = {}
-        for point in [] if force else read_points(folder, self.identity):
-            setting = setting_of(point)
-            names = subject.names(setting)  # keys name files, so they are not taken from this one
-            if all(path.is_file() for path in self._pictures(names["key"])):
-                self.points[setting] = replace(point, key=names["key"], label=names["label"], command=names["command"])
         self.dense = whole_of(subject.dense, DENSE)
         """The setting of the dense scene's point."""
+        self.points: dict[Setting, Point] = {}
+        for setting, point in ({} if force else read_points(folder, self.identity)).items():
+            names = subject.names(setting)  # keys name files, so they are not taken from this one
+            needed = self._pictures(names["key"])
+            needed += self._pictures("photo") if setting == self.dense and judged.photos is not None else []
+            if all(path.is_file() for path in needed):
+                self.points[setting] = replace(point, key=names["key"], label=names["label"], command=names["command"])
         if self.dense in self.points:
             self.measurer.dense_ms = self.points[self.dense].frame_ms
 
@@ -221,7 +222,7 @@ class Sweep:
 
         judged = self.measurer.judged_views
         for path, photo, index in zip(self._pictures(point.key), self._pictures("photo"), self._pictured, strict=True):
-            write_picture(render(scene, judged.views[index]), path)
+            write_picture(render(scene.detach(), judged.views[index]), path)
             if judged.photos is not None and setting == self.dense:
                 write_picture(judged.photos[index], photo)
         if self._frame is not None:

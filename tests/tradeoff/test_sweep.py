@@ -137,6 +137,8 @@ def content(tmp_path_factory, room, room_views) -> dict:
         (lambda content: content["points"][1].update(gaussians=-1), "gaussians is -1"),
         (lambda content: content["points"][1].update(frame_ms=math.nan), "frame_ms is nan"),
         (lambda content: content["points"][1]["against_photos"].update(ssim="good"), "ssim is 'good'"),
+        (lambda content: content["points"][1].update(repair="magic"), "repairs are magic"),
+        (lambda content: content["points"][1].update(by="magic"), "no method is called 'magic'"),
         (lambda content: content["points"][1].pop("key"), "key"),
         (lambda content: content.pop("points"), "lacks 'points'"),
         (lambda content: content["points"].append(None), "not iterable"),
