@@ -116,8 +116,8 @@ def compact_source(
                 check_photos(dense, photos, str(scene))
             result = compact_scene(dense, request, source, report, photos)
         else:
-            from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
             from pointsplat_ns.tradeoff.finding import find_scene
+            from pointsplat_ns.tradeoff.measure import subject_of
             from pointsplat_ns.tradeoff.settings import repairs_of
 
             size, upward = parse_resolution(resolution), up_named(up)

@@ -24,12 +24,12 @@ from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.nerfstudio_plugin.measure_tradeoff import subject_of
 from pointsplat_ns.pruning import Keep, cut_sh
 from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.finding import find_scene
+from pointsplat_ns.tradeoff.measure import subject_of
 from pointsplat_ns.tradeoff.settings import Repair, repairs_of
 from pointsplat_ns.tradeoff.targets import Targets, targets_of
 

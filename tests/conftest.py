@@ -150,7 +150,7 @@ def plain_page(monkeypatch) -> list[Path]:
     for."""
     asked: list[Path] = []
 
-    def write_sweep_page(sweep, folder: Path, output: Path, progress=None) -> Path:
+    def write_sweep_page(sweep, folder: Path, output: Path, flight=None, progress=None) -> Path:
         asked.append(folder)
         output.write_text(" ".join(point.key for point in sweep.points))
         return output

@@ -23,7 +23,7 @@ from lab.tables.means import Group, SceneCells
 from lab.tables.outputs import medians, plot_figure
 from lab.tables.ways import WAYS
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tradeoff.journal import restored_point
+from pointsplat_ns.tradeoff.points import restored_point
 
 ROOT = Path(__file__).parents[2]
 

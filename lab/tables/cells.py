@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lab.tables.journal import Form
 from lab.tables.scene import TableOptions, TableScene
 from lab.tables.ways import WAYS
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.pruning.scores import log_volume
-from pointsplat_ns.tradeoff.journal import Form, check_types, restored_point
-from pointsplat_ns.tradeoff.points import Point
+from pointsplat_ns.tradeoff.points import Point, check_types, restored_point
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lab.tables.cells import TABLE_FILES
+from lab.tables.journal import check_journal_folder
 from lab.tables.making import Refiners, Tools
 from lab.tables.means import Group
 from lab.tables.measuring import Measuring
@@ -25,7 +26,6 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, has_masks
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
 

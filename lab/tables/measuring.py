@@ -24,7 +24,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.judging import Judge, Judged
-from pointsplat_ns.tradeoff.machine import machine_text, one_at_a_time
+from pointsplat_ns.tradeoff.machine import machine_text
 from pointsplat_ns.tradeoff.measuring import MadeScene, point_of
 from pointsplat_ns.tradeoff.points import Point
 from pointsplat_ns.tradeoff.settings import DENSE
@@ -98,8 +98,7 @@ class Measuring:
         key = work.key(way, share)
         before = work.journal.cells.get((way.name, share))
         try:
-            with one_at_a_time(self.progress):
-                cell = work.measure(way, share, show)
+            cell = work.measure(way, share, show)
         except PointSplatError as error:  # other cells continue
             self.missing[key] = str(error)
             logger.warning("%s: left out: %s", key, error)
@@ -149,7 +148,7 @@ class _SceneWork:
         """Measure a cell and write it."""
         _, maker, judge = self._opened
         made = maker.make(way, share, show)
-        judged = judge.judge(made.scene, self.key(way, share), lambda part: show("", part))
+        judged = judge.judge(made.scene, lambda part: show("", part))
         if way.name == DENSE:
             judged = replace(judged, against_dense=replace(judged.against_dense, psnr=math.inf))
         opacities, volumes = distributions(made.scene, way.name, share)

@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 def tradeoff(
     scene: Scene,
     output: Output = None,
-    points: int = 12,
+    keep: tuple[str, ...] | None = None,
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
+    sh: tuple[Literal["all", "0", "1", "2", "3"], ...] = ("all",),
     repairs: tuple[Literal["none", "refiner", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
     poses: Poses = None,
@@ -44,19 +45,20 @@ def tradeoff(
 ) -> None:
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
-    It measures where the front bends and stops where it is flat. Each point is saved as soon as it is measured: after
+    It measures each method, SH degree and repair at each budget. Each point is saved as soon as it is measured: after
     an interruption the same command goes on. With a target it searches for the cheapest scene that meets all targets
     instead, and writes it.
 
     Args:
         scene: a file of any format, a checkpoint, or a run (its folder or config.yml). Held-out photos
             of a run are used where they are found.
-        output: the folder for points, pictures, tables, plots and the page; by default beside the scene: room_tradeoff
+        output: the folder for points, pictures, the table and the page; by default beside the scene: room_tradeoff
             for room.ply, tradeoff in the folder of a run.
-        points: largest number of scenes, with the dense scene.
+        keep: budgets: ratios (30%), counts (50000) or sizes (12MB); by default 70%, 50%, 30%, 20%, 10% and 5%.
         within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
             renders.
-        by: methods of prune; the first is measured in detail, others at three budgets.
+        by: methods of prune; a search for targets uses the first one.
+        sh: SH degrees to measure: all bands, or those up to a degree.
         repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
@@ -80,13 +82,13 @@ def tradeoff(
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.front import next_best
-    from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
+    from pointsplat_ns.tradeoff.results import SWEEP_FILES
 
     check_poses(poses)
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
-            scene, folder, points=points, within=within, by=by, repairs=repairs, views=views, poses=poses,
+            scene, folder, keep=keep, within=within, by=by, sh=sh, repairs=repairs, views=views, poses=poses,
             resolution=resolution, up=up, data=data, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
             force=force, progress=True,
         )  # fmt: skip
@@ -101,7 +103,7 @@ def tradeoff(
     best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
     if best.command:
         print(f"$ {best.command}")
-    print(f"{folder}: tables, plots and pictures; open {folder / 'tradeoff.html'}")
+    print(f"{folder}: table and pictures; open {folder / SWEEP_FILES.page}")
 
 
 def _print_table(found: Tradeoff) -> None:

@@ -36,8 +36,6 @@ class FolderFiles:
     levels_picture: str = "lod.png"
     sweep: str = "tradeoff.json"
     """Results of a sweep."""
-    sweep_points: str = "points.json"
-    """Journal of a sweep."""
 
 
 FOLDER_FILES = FolderFiles()

@@ -18,7 +18,7 @@ else:
 
 
 @contextmanager
-def claim(path: Path, wait: bool = False, mode: int | None = None) -> Iterator[bool]:
+def claim(path: Path, wait: bool = False) -> Iterator[bool]:
     """Hold the lock of a file, whose missing folders are created, while the context is open. Yields whether the lock is
     held here; always true with ``wait``, for a lock that another process or thread holds.
 
@@ -29,7 +29,6 @@ def claim(path: Path, wait: bool = False, mode: int | None = None) -> Iterator[b
     Args:
         path: the file.
         wait: wait until nobody else holds it.
-        mode: permissions of a new file; by default those of any new file.
 
     Raises:
         OSError: if the file system has no locks, the file cannot be written, or is a link, a pipe or a device.
@@ -43,7 +42,7 @@ def claim(path: Path, wait: bool = False, mode: int | None = None) -> Iterator[b
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        descriptor = _opened(path, mode)
+        descriptor = _opened(path)
         try:
             held = _locked(descriptor, wait)
             if held and not _is_at(descriptor, path):  # it was removed or replaced meanwhile
@@ -54,26 +53,24 @@ def claim(path: Path, wait: bool = False, mode: int | None = None) -> Iterator[b
             os.close(descriptor)  # which ends the lock
 
 
-def _opened(path: Path, mode: int | None) -> int:
+def _opened(path: Path) -> int:
     """A descriptor of a regular file, which is created if there is none, and is neither emptied nor changed."""
     flags = os.O_RDWR
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_NOINHERIT"):
         flags |= getattr(os, name, 0)
     while True:
         try:
-            descriptor, new = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
+            descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
             if path.is_symlink():
                 raise OSError(errno.ELOOP, f"its lock {path.name} is a link, remove it", str(path)) from None
             try:
-                descriptor, new = os.open(path, flags), False
+                descriptor = os.open(path, flags)
             except FileNotFoundError:  # removed meanwhile
                 continue
         try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise OSError(errno.EINVAL, f"its lock {path.name} is not a regular file, remove it", str(path))
-            if new and mode is not None:
-                os.chmod(path if sys.platform == "win32" else descriptor, mode)
         except BaseException:
             os.close(descriptor)
             raise

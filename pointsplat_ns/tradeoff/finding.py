@@ -15,9 +15,9 @@ from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.machine import busy_note
 from pointsplat_ns.tradeoff.measuring import Measurer, Subject, through_file
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import Repair, Setting
-from pointsplat_ns.tradeoff.targets import Targets, TargetSearch
-from pointsplat_ns.tradeoff.walk import Plan
+from pointsplat_ns.tradeoff.search import TargetSearch
+from pointsplat_ns.tradeoff.settings import Repair, Setting, whole_of
+from pointsplat_ns.tradeoff.targets import Targets
 
 
 def find_scene(
@@ -48,10 +48,8 @@ def find_scene(
     size, bytes_of = _estimated(subject), kind.bytes_of
     if bytes_of is not None:
         size = lambda count, degree: bytes_of(count, degree, dense.traits)  # noqa: E731
-    plan = Plan(len(dense), dense.sh_degree, (by,), repairs)
-    search = TargetSearch(
-        targets, plan, measure, measurer.cut_psnr, measurer.judged_views.where, size, exact=kind.suffix == ".ply"
-    )
+    where, exact = measurer.judged_views.where, kind.suffix == ".ply"
+    search = TargetSearch(targets, whole_of(dense, by), repairs, measure, measurer.cut_psnr, where, size, exact)
     interrupted = False
     try:
         if timed:
@@ -63,7 +61,7 @@ def find_scene(
             raise
         found = so_far
     if timed:
-        measurer.note(busy_note([p.others_cores for p in search.tried.values() if p.others_cores is not None]))
+        measurer.note(busy_note([point.others_cores for point in search.tried.values()]))
     made = measurer.made(found.setting, progress)
     compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.tradeoff.points import ImageMetrics, Point, speed_of
+from pointsplat_ns.tradeoff.points import Point, speed_of
 
 Reference = Literal["renders", "photos"]
 """Targets of a comparison: renders of the dense scene, or held-out photos."""
@@ -24,7 +24,7 @@ PHOTO_PSNR = 27.0
 
 def metric_of(point: Point, reference: Reference, metric: Metric) -> float | None:
     """A metric of a point; None where it was not measured. A PSNR may be infinite."""
-    quality: ImageMetrics | None = point.against_dense if reference == "renders" else point.against_photos
+    quality = point.against_dense if reference == "renders" else point.against_photos
     value = None if quality is None else getattr(quality, metric)
     return None if value is None or math.isnan(value) else value
 
@@ -47,28 +47,6 @@ def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
     """The points sorted by time of a frame, then number of Gaussians, then size of the file; times that are not
     ``trusted`` are ignored."""
     return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
-
-
-def fastest_within(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
-    """The fastest point whose PSNR against photos is at most ``db`` below that of the first point, the dense scene;
-    None where there are no photos. ``trusted`` as for :func:`fastest_first`."""
-    dense = metric_of(points[0], "photos", "psnr")
-    return None if dense is None else _fastest(points, "photos", dense - db, trusted)
-
-
-def fastest_above(points: Sequence[Point], db: float, trusted: bool = True) -> Point | None:
-    """The fastest point with at least ``db`` dB against the dense scene's renders; None if there are no points, because
-    the dense scene itself has an infinite PSNR. ``trusted`` as for :func:`fastest_first`."""
-    return _fastest(points, "renders", db, trusted)
-
-
-def _fastest(points: Sequence[Point], reference: Reference, least: float, trusted: bool) -> Point | None:
-    # 1e-9, because differences of decimal numbers are not exact: 30.1 - 0.5 is not 29.6.
-    for point in fastest_first(points, trusted):
-        quality = metric_of(point, reference, "psnr")
-        if quality is not None and quality >= least - 1e-9:
-            return point
-    return None
 
 
 def expected_loss(psnr: float) -> float:
@@ -103,11 +81,18 @@ def next_best(points: Sequence[Point]) -> Point | None:
     return min(points[1:], key=lambda point: (loss_of(point, points[0]), point.gaussians), default=None)
 
 
+def fastest_within(points: Sequence[Point], loss: float, trusted: bool = True) -> Point:
+    """The fastest point that loses at most ``loss`` dB. The first point is the dense scene, which loses nothing.
+    ``trusted`` as for :func:`fastest_first`."""
+    # 1e-9, because differences of decimal numbers are not exact: 30.1 - 29.6 is more than 0.5.
+    return next(p for p in fastest_first(points, trusted) if loss_of(p, points[0]) <= loss + 1e-9)
+
+
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
     """The fastest point that loses at most ``within`` dB, and a line of text on it. The first point is the dense scene;
     if it is the fastest, the text has the figures of the next best too. ``trusted`` as for :func:`fastest_first`."""
     dense = points[0]
-    best = fastest_within(points, within, trusted) or fastest_above(points, psnr_within(within), trusted) or dense
+    best = fastest_within(points, within, trusted)
     if dense.against_photos is not None:
         limit = f"within {within:g} dB of the dense scene's {dense.against_photos.psnr:.1f} dB against held-out photos"
     else:
@@ -131,4 +116,5 @@ def _figures(point: Point, dense: Point, trusted: bool) -> str:
     figures = f"{point.gaussians:,} Gaussians, {bytes_text(point.bytes)} in place of {bytes_text(dense.bytes)}"
     if not trusted:
         return figures
-    return f"{figures}, {speed_of(point, dense)}: {point.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"
+    speed = f"{speed_of(point, dense).median:.2g} times as fast"
+    return f"{figures}, {speed}: {point.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
@@ -19,7 +18,6 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
@@ -28,8 +26,8 @@ from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.cores import OtherPrograms
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.tradeoff.points import ImageMetrics, picture_path
-from pointsplat_ns.views import View, Views, spread_indices
+from pointsplat_ns.tradeoff.points import ImageMetrics
+from pointsplat_ns.views import View, Views
 
 ROUNDS = 3
 """Number of timed frames of each view, alternating between the dense scene and the judged scene."""
@@ -89,37 +87,28 @@ class Judge:
     """Judges scenes in the same views, against the same targets: the dense scene's renders, and photos if there are
     some.
 
-    Pictures go to the folder of the sweep, if one is given. ``dense_ms`` is the time of a frame of the dense scene in
-    milliseconds, the unit of measured ratios; by default it is measured beside the first timed scene. Raises DataError
-    if the views are too small for SSIM, and SceneError if a picture cannot be written.
+    ``dense_ms`` is the time of a frame of the dense scene in milliseconds, the unit of measured ratios; by default it
+    is measured beside the first timed scene. Raises DataError if the views are too small for SSIM.
     """
 
     @torch.no_grad()
-    def __init__(
-        self, dense: Gaussians, judged_views: JudgedViews, folder: Path | None = None, dense_ms: float | None = None
-    ):
-        self.views, self.photos, self.folder = judged_views.views, judged_views.photos, folder
-        self.dense, self.dense_ms = dense, dense_ms
+    def __init__(self, dense: Gaussians, judged_views: JudgedViews, dense_ms: float | None = None):
+        self.views, self.photos, self.dense, self.dense_ms = judged_views.views, judged_views.photos, dense, dense_ms
         if min(self.views.width, self.views.height) < SSIM_WINDOW:
             raise DataError(
                 f"views are {self.views.width} x {self.views.height} pixels; expected at least {SSIM_WINDOW} a side"
             )
         self.reference = DenseReference(dense, self.views)
         self.lpips, self.no_lpips = _lpips(self.reference.renders[0])
-        self.pictured = spread_indices(len(self.views), 6)
-        if self.photos is not None:
-            self._write([self.photos[i] for i in self.pictured], "photo")
 
     @torch.no_grad()
-    def judge(self, scene: Gaussians, key: str, progress: Callable[[float], None], timed: bool = True) -> Judged:
-        """Render a scene, write pictures of it under the key of its point, and time it if ``timed``. ``progress`` is
-        called with the share done."""
+    def judge(self, scene: Gaussians, progress: Callable[[float], None], timed: bool = True) -> Judged:
+        """Render a scene, and time it if ``timed``. ``progress`` is called with the share done."""
         images = []
         passes = 1 + 2 * ROUNDS * timed
         for view in self.views:
             images.append(render(scene, view))
             progress(len(images) / (passes * len(self.views)))
-        self._write([images[i] for i in self.pictured], key)
         photos = None
         if self.photos is not None:
             pairs = [(image, photo.to(image)) for image, photo in zip(images, self.photos, strict=True)]
@@ -154,20 +143,9 @@ class Judge:
         """PSNR of a scene against the dense scene's renders, over the pixels that the dense scene covers, dB."""
         return min(self.reference.psnr(scene)[0], MOST_PSNR)
 
-    def pictures(self, key: str) -> list[Path]:
-        """Paths of the pictures of a point; empty without a folder."""
-        if self.folder is None:
-            return []
-        return [picture_path(self.folder, number, key) for number in range(len(self.pictured))]
-
     def _perceived(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> float | None:
         """Mean LPIPS over pairs of pictures; None without its weights."""
         return None if self.lpips is None else fmean(float(self.lpips(*pair)) for pair in pairs)
-
-    def _write(self, images: list[Tensor], key: str) -> None:
-        if self.folder is not None:
-            for path, image in zip(self.pictures(key), images, strict=True):
-                write_picture(image, path)
 
 
 def _timed(scene: Gaussians, view: View) -> float:

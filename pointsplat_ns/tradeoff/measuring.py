@@ -1,12 +1,12 @@
-"""Makes the scene of a setting like its command, judges it and times it, while no other measurement runs."""
+"""Makes the scene of a setting like its command, judges it and times it."""
 
 from __future__ import annotations
 
 import math
+import shlex
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from pointsplat_ns.compression.compact import Compacted, compact_scene, rounding
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
+from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import usable_part
@@ -32,9 +32,8 @@ from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.judging import Judge, Judged, JudgedViews
-from pointsplat_ns.tradeoff.machine import one_at_a_time
 from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Naming, Setting
+from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting, whole_of
 from pointsplat_ns.views import Views
 
 HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
@@ -49,8 +48,7 @@ class Subject:
     path: Path
     """Path of the scene in commands."""
     name: str
-    sha256: str
-    """Hash of the file."""
+    """Name of the scene in files of commands."""
     new_views: Callable[[], ViewSource]
     """Makes a new source of its views, the same as for its commands."""
     held_out: HeldOut | None = None
@@ -59,12 +57,35 @@ class Subject:
     """The refiner before repairs. None is no refiner, but the shipped one for the repair ``refiner``."""
     suffix: str = ".ply"
     """Suffix of the format of smaller scenes."""
-    poses: Path | None = None
-    """Path of its file of cameras in commands; None if there is none."""
+    words: tuple[str, ...] = ()
+    """Options of its commands on views, such as ``--poses FILE``."""
     resolution: tuple[int, int] | None = None
     """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
     training: Photos | None = None
     """Its training photos, for the repair ``photos``."""
+
+    def names(self, setting: Setting) -> dict[str, str]:
+        """The key, the label and the command of a setting's point. The command has the count, because percentages are
+        rounded."""
+        if setting.by == DENSE:
+            return {"key": DENSE, "label": DENSE, "command": ""}
+        percent, cut = 100 * setting.count / len(self.dense), setting.sh_degree != self.dense.sh_degree
+        merged, repaired = setting.by == "merge", setting.repair != "none"
+        keys = [f"{percent:.4g}pct", f"sh{setting.sh_degree}"]
+        keys += [setting.repair] * repaired + [setting.by] * (not merged)
+        labels = [f"{percent:.3g} %" + ("" if merged else f" by {setting.by}")]
+        labels += [f"SH degree {setting.sh_degree}"] * cut
+        named = {"none": [], "refiner": ["refined"], "photos": ["trained on photos"]}
+        labels += named.get(setting.repair, [f"repaired ({setting.repair})"])
+        words = ["pointsplat", "compact" if repaired else "prune", str(self.path), "--keep", str(setting.count)]
+        words += [*self.words, *(["--by", setting.by] if repaired or not merged else [])]
+        words += ["--sh", str(setting.sh_degree)] if cut else []
+        words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
+        words += ["--effort", EFFORTS[setting.repair]] if repaired else []
+        words += ["--photos"] if setting.repair == "photos" else []
+        key = "_".join(keys)
+        command = shlex.join([*words, "-o", f"{self.name}_{key}.ply"])
+        return {"key": key, "label": ", ".join(labels), "command": command}
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,26 +163,16 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
 
 
 class Measurer:
-    """Makes scenes of settings and measures them in at most ``views`` views.
+    """Makes scenes of settings and measures them in at most ``views`` views. Without ``timed``, times are NaN. Raises
+    SceneError if no Gaussian can be drawn, and DataError if there are no views."""
 
-    Pictures go to ``folder``, if there is one. Without ``timed``, times are NaN, and other measurements may run at the
-    same time. ``progress`` is called with a text while waiting for the lock. Raises SceneError if no Gaussian can be
-    drawn, and DataError if there are no views.
-    """
-
-    def __init__(
-        self, subject: Subject, views: int, progress: Progress, folder: Path | None = None, timed: bool = True
-    ):
+    def __init__(self, subject: Subject, views: int, progress: Progress, timed: bool = True):
         need_usable(subject.dense)
-        self.subject, self.dense, self.folder, self.timed = subject, subject.dense, folder, timed
+        self.subject, self.dense, self.timed = subject, subject.dense, timed
         self.dense_ms: float | None = None
         """Time of a frame of the dense scene from an earlier measurement; set before the first judgement."""
         self.notes: dict[str, None] = {}
-        self.naming = Naming(
-            *(subject.path, subject.name, len(self.dense), self.dense.sh_degree, subject.poses, subject.resolution)
-        )
         self._kept: dict[Setting, MadeScene] = {}
-        self._progress = progress
         progress("looking for views", 0.0)
         self.judged_views, note = views_to_judge(subject, views)
         self.note(note)
@@ -174,7 +185,7 @@ class Measurer:
     @cached_property
     def judge(self) -> Judge:
         """The judge of all scenes."""
-        judge = Judge(self.dense, self.judged_views, self.folder, self.dense_ms)
+        judge = Judge(self.dense, self.judged_views, self.dense_ms)
         self.note(judge.no_lpips)
         return judge
 
@@ -184,18 +195,13 @@ class Measurer:
 
     def measure_dense(self, show: Progress) -> Point:
         """The dense scene's point; ``show`` as for :meth:`measure`."""
-        setting = Setting(len(self.dense), self.dense.sh_degree, by=DENSE)
-        with self._alone():
-            point = self._point(setting, MadeScene(self.dense, 0.0, None), DENSE, DENSE, "", show)
+        point = self._point(whole_of(self.dense, DENSE), MadeScene(self.dense, 0.0, None), show)
         return replace(point, against_dense=replace(point.against_dense, psnr=math.inf))
 
     def measure(self, setting: Setting, show: Progress) -> Point:
         """The point of a setting. ``show`` is called with the name of the current task (empty during the judgement) and
         its share done."""
-        naming = self.naming
-        names = (naming.key(setting), naming.label(setting), naming.command(setting))
-        with self._alone():
-            return self._point(setting, self.made(setting, show), *names, show)
+        return self._point(setting, self.made(setting, show), show)
 
     def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
         """The scene of a setting. The latest scenes are kept, with no more Gaussians in all than the dense scene."""
@@ -220,23 +226,11 @@ class Measurer:
         )
         return replace(made, scene=compacted.scene.to(made.scene.device), compacted=compacted)
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        if not self.timed:
-            yield
-            return
-        with one_at_a_time(self._progress) as alone:
-            yield
-        if not alone:
-            self.note("another user's lock on measurements could not be taken: both may have measured at once")
-
-    def _point(self, setting: Setting, made: MadeScene, key: str, label: str, command: str, show: Progress) -> Point:
+    def _point(self, setting: Setting, made: MadeScene, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
-        judged = self.judge.judge(scene, key, lambda share: show("", share), self.timed)
-        return point_of(
-            made, judged, key=key, label=label, command=command, by=setting.by, share=setting.count / len(self.dense),
-            repair=setting.repair, bytes=size,
-        )  # fmt: skip
+        judged = self.judge.judge(scene, lambda done: show("", done), self.timed)
+        figures = {"by": setting.by, "share": setting.count / len(self.dense), "repair": setting.repair, "bytes": size}
+        return point_of(made, judged, **self.subject.names(setting), **figures)
 
 
 def point_of(made: MadeScene, judged: Judged, **named: Any) -> Point:

@@ -1,5 +1,5 @@
 """Writes the tradeoff of a scene as one HTML file: an interactive front, pictures to compare, a recommendation,
-and a flight through scenes, whose files are kept in the folder of the sweep."""
+and a flight through the recommended scene."""
 
 from __future__ import annotations
 
@@ -21,48 +21,46 @@ from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.front import (
-    Cost,
-    Metric,
-    Reference,
-    fastest_above,
-    fastest_first,
-    fastest_within,
-    metric_of,
-    pareto_front,
-    psnr_within,
-)
-from pointsplat_ns.tradeoff.points import Point, Tradeoff, flight_path, picture_path, speed_of
+from pointsplat_ns.tradeoff.front import Cost, Metric, Reference, fastest_first, metric_of, pareto_front, psnr_within
+from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path, speed_of
 
 FLIGHT_BYTES = 4_000_000
 """Largest size of a page's scenes in bytes; the rest of the page is for its pictures."""
 
-
-Picture = Callable[[], np.ndarray]
+REFERENCES: tuple[Reference, ...] = get_args(Reference)
+METRICS: tuple[Metric, ...] = get_args(Metric)
+COSTS: tuple[Cost, ...] = get_args(Cost)
 
 
 def write_sweep_page(
-    sweep: Tradeoff, folder: Path, output: Path, progress: bool | Progress = False, max_bytes: int = 10_000_000
+    sweep: Tradeoff,
+    folder: Path,
+    output: Path,
+    flight: dict[str, Any] | None = None,
+    progress: bool | Progress = False,
+    max_bytes: int = 10_000_000,
 ) -> Path:
     """Write one self-contained HTML file with the points of a sweep, which needs no other file; returns its path.
 
     It plots quality against cost with the Pareto front. A slider along the front shows every view beside the dense
     scene and the photo, with an error map and a wipe. Below are the fastest good point with its command, and a table of
-    all points. Views are those with a picture of the dense scene, in the folder of the sweep. The page has a flight
-    through the recommended scene, if it is at :func:`~pointsplat_ns.tradeoff.points.flight_path`, beside the dense
-    scene if both fit.
+    all points. Views are those with a picture of the dense scene, in the folder of the sweep.
+
+    Args:
+        sweep: the points.
+        folder: of the sweep, with its pictures.
+        output: path of the page.
+        flight: data of :func:`flight_beside`, if there is a flight.
+        progress: as for :func:`pointsplat_ns.prune`.
+        max_bytes: largest size of the page: it should fit into mails and open quickly.
 
     Raises:
-        DataError: if there is no point or no view, a picture is missing, damaged or of another size than the views, or
-            the page does not fit into ``max_bytes``: it should fit into mails and open quickly.
+        DataError: if there is no view, a picture is missing, damaged or of another size than the views, or the page
+            does not fit into ``max_bytes``.
         SceneError: if the file cannot be written.
     """
-    if not sweep.points:
-        raise DataError(f"{folder}: nothing was measured; expected the dense scene and at least one smaller one")
     views = _pictures(sweep, folder)
     sources = [picture for view in views for picture in view.values()]
-    dense, recommended = sweep.points[0].key, sweep.recommended
-    flight = read_flight_beside(flight_path(folder, recommended), flight_path(folder, dense))
     values, data = _values(sweep, len(views)), {**_data(sweep), "flight": flight}
     scripts = ("chart.js", *(FLIGHT_SCRIPTS if flight else ()), "tradeoff.js")
 
@@ -81,14 +79,14 @@ def write_sweep_page(
     return output
 
 
-def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
+def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Callable[[], np.ndarray]]]:
     """For each view, functions that read or compute its pictures, by name: a point's key, ``photo``, or ``renders:KEY``
     and ``photos:KEY`` for the error map of a point.
 
     Error maps are computed from the PNG files, so that they do not show errors of the page's compression.
     """
     dense = sweep.points[0].key
-    views: list[dict[str, Picture]] = []
+    views: list[dict[str, Callable[[], np.ndarray]]] = []
 
     def read(path: Path) -> np.ndarray:
         return read_png(path, width=sweep.width, height=sweep.height)
@@ -97,18 +95,17 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
         return error_map(read(path), read(reference))
 
     for view in takewhile(lambda view: picture_path(folder, view, dense).exists(), count()):
+        references = {"renders": picture_path(folder, view, dense)}
+        pictures: dict[str, Callable[[], np.ndarray]] = {}
         photo = picture_path(folder, view, "photo")
-        has_photo = photo.exists()
-        pictures: dict[str, Picture] = {"photo": functools.partial(read, photo)} if has_photo else {}
+        if photo.exists():
+            references["photos"], pictures["photo"] = photo, functools.partial(read, photo)
         for point in sweep.points:
             path = picture_path(folder, view, point.key)
             pictures[point.key] = functools.partial(read, path)
-            if point.key != dense:
-                pictures[f"renders:{point.key}"] = functools.partial(
-                    difference, path, picture_path(folder, view, dense)
-                )
-            if has_photo:
-                pictures[f"photos:{point.key}"] = functools.partial(difference, path, photo)
+            for name, reference in references.items():
+                if path != reference:
+                    pictures[f"{name}:{point.key}"] = functools.partial(difference, path, reference)
         views.append(pictures)
     if not views:
         raise DataError(f"{picture_path(folder, 0, dense)}: no such file; expected pictures of at least one view")
@@ -117,44 +114,22 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Picture]]:
 
 def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     """Values for the template itself, without scripts."""
-    within_db = 0.5  # initial loss of PSNR against photos
-    above_db = round(psnr_within(within_db), 1)  # the same against renders, where there are no photos
-    has_photos = metric_of(sweep.points[0], "photos", "psnr") is not None
-    has_lpips = any(metric_of(point, "renders", "lpips") is not None for point in sweep.points)
-    rows = [{"key": point.key, "label": point.label, "cells": _cells(point, sweep.points[0])} for point in sweep.points]
-    titles = {
-        "share": "kept",
-        "gaussians": "Gaussians",
-        "sh_degree": "SH",
-        "bytes": "MB",
-        "speed": "times as fast",
-        "frame_ms": "ms a frame",
-        "fill": "fill",
-        **{
-            f"{reference}_{metric}": f"{title}, {reference}"
-            for reference in get_args(Reference)
-            for metric, title in zip(get_args(Metric), ("PSNR dB", "SSIM", "LPIPS"), strict=True)
-        },
-        "seconds": "made in, s",
-        "peak_bytes": "peak memory, GB",
-    }
-    columns = [name for name in titles if (has_photos or "photos" not in name) and (has_lpips or "lpips" not in name)]
-    if all(point.peak_bytes is None for point in sweep.points):
-        columns.remove("peak_bytes")
+
+    def measured(reference: Reference, metric: Metric) -> bool:
+        return any(metric_of(point, reference, metric) is not None for point in sweep.points)
+
     return {
         "sweep": sweep,
         "views": views,
-        "references": get_args(Reference) if has_photos else get_args(Reference)[:1],
-        "metrics": get_args(Metric) if has_lpips else get_args(Metric)[:2],
-        "recommended": fastest_within(sweep.points, within_db, sweep.times_trusted)
-        or fastest_above(sweep.points, above_db, sweep.times_trusted)
-        or sweep.points[0],
-        "rows": rows,
-        "columns": [(name, titles[name]) for name in columns],
+        "references": [name for name in REFERENCES if measured(name, "psnr")],
+        "metrics": [name for name in METRICS if measured("renders", name)],
+        "speed_of": speed_of,
+        "metric_of": metric_of,
+        "three_digits": three_digits,
+        "infinity": math.inf,
         "amplified": ERROR_GAIN,
         "full_level": math.ceil(255 / ERROR_GAIN),
-        "within_db": within_db,
-        "above_db": above_db,
+        "above_db": round(psnr_within(sweep.within), 1),
         "ramp": ["#" + bytes(color).hex() for color in error_colors()[::17].tolist()],
     }
 
@@ -162,12 +137,12 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
 def _data(sweep: Tradeoff) -> dict[str, Any]:
     """Data for the scripts, except pictures. An infinite number is the text "Infinity"."""
 
-    def qualities(point: Point, reference: Any) -> dict[str, float | str | None]:
-        values = {metric: metric_of(point, reference, metric) for metric in get_args(Metric)}
+    def qualities(point: Point, reference: Reference) -> dict[str, float | str | None]:
+        values = {metric: metric_of(point, reference, metric) for metric in METRICS}
         return {metric: "Infinity" if value == math.inf else value for metric, value in values.items()}
 
-    def fronts(reference: Any, metric: Any) -> dict[str, list[str]]:
-        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in get_args(Cost)}
+    def fronts(reference: Reference, metric: Metric) -> dict[str, list[str]]:
+        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in COSTS}
 
     return {
         "points": [
@@ -178,12 +153,12 @@ def _data(sweep: Tradeoff) -> dict[str, Any]:
                 "group": _group(point),
                 "low": point.frame_ms_low,
                 "high": point.frame_ms_high,
-                **{cost: getattr(point, cost) for cost in get_args(Cost)},
-                **{reference: qualities(point, reference) for reference in get_args(Reference)},
+                **{cost: getattr(point, cost) for cost in COSTS},
+                **{reference: qualities(point, reference) for reference in REFERENCES},
             }
             for point in sweep.points
         ],
-        "fronts": {ref: {metric: fronts(ref, metric) for metric in get_args(Metric)} for ref in get_args(Reference)},
+        "fronts": {reference: {metric: fronts(reference, metric) for metric in METRICS} for reference in REFERENCES},
         "fastest": [point.key for point in fastest_first(sweep.points, sweep.times_trusted)],
     }
 
@@ -195,59 +170,33 @@ def _group(point: Point) -> str:
     return f"{point.by}, " + ("not repaired" if point.repair == "none" else f"repaired ({point.repair})")
 
 
-def _cells(point: Point, dense: Point) -> dict[str, tuple[float | None, str]]:
-    """A point for the table: by column, a number to sort by (None: unknown) and its text."""
-    speed, ms = speed_of(point, dense), point.frame_ms
-    cells: dict[str, tuple[float | None, str]] = {
-        "share": (point.share, f"{100 * point.share:.3g} %"),
-        "gaussians": (point.gaussians, f"{point.gaussians:,}"),
-        "sh_degree": (point.sh_degree, str(point.sh_degree)),
-        "bytes": (point.bytes, three_digits(point.bytes / 1e6)),
-        "speed": (speed.median, f"{speed.median:.2f} ({speed.low:.2f}–{speed.high:.2f})"),
-        "frame_ms": (ms, f"{ms:,.0f}" if ms >= 100 else f"{ms:.1f}"),
-        "fill": (point.fill, "–" if point.fill is None else f"{point.fill:.1f}"),
-        "seconds": (point.seconds, f"{point.seconds:.1f}"),
-        "peak_bytes": (point.peak_bytes, "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e9:.2f}"),
-    }
-    for reference in get_args(Reference):
-        for metric, digits in zip(get_args(Metric), (2, 3, 3), strict=True):
-            value = metric_of(point, reference, metric)
-            text = "–" if value is None else "identical" if value == math.inf else f"{value:.{digits}f}"
-            cells[f"{reference}_{metric}"] = (value, text)
-    return cells
+def _scene_path(folder: Path, key: str) -> Path:
+    return folder / "scenes" / f"{key}.json"
 
 
-def keep_flight(frame: FlightFrame, scene: Gaussians, name: str, path: Path) -> bool:
-    """Write a scene for the page to a file at :func:`~pointsplat_ns.tradeoff.points.flight_path`, under a name, if it
-    is small enough. Returns whether it was written."""
+def keep_scene(frame: FlightFrame, scene: Gaussians, point: Point, folder: Path) -> None:
+    """Write a point's scene for the page to the folder of a sweep, if it is small enough."""
     if ply_bytes(len(scene), scene.sh_degree) > 20 * FLIGHT_BYTES:  # SPZ in a page has at least a tenth of the bytes
-        return False
-    packed = frame.packed(scene, name)
-    if len(packed["spz"]) > 0.99 * FLIGHT_BYTES:  # the rest is for the views
-        return False
-    write_json(frame.data([packed]), path)
-    return True
+        return
+    packed = frame.packed(scene, point.label)
+    if len(packed["spz"]) <= FLIGHT_BYTES:
+        write_json(packed, _scene_path(folder, point.key))
 
 
-def read_flight_beside(path: Path, dense: Path) -> dict[str, Any] | None:
-    """Read a scene of :func:`keep_flight`, with the dense scene, of another file, on the left if both fit; None if
-    there is no such file, or it holds something else."""
-    flight = _read(path)
-    beside = _read(dense) if dense != path else None
-    if flight is None or beside is None:
-        return flight
-    scenes = [*beside["scenes"], *flight["scenes"]]
-    return {**flight, "scenes": scenes} if sum(len(scene["spz"]) for scene in scenes) <= FLIGHT_BYTES else flight
+def flight_beside(frame: FlightFrame, folder: Path, dense: str, key: str) -> dict[str, Any] | None:
+    """Data of a flight through the scene of a point that :func:`keep_scene` wrote, with the dense scene on the left if
+    both fit; None if there is no such file, or it holds something else."""
+    scenes = [_packed(_scene_path(folder, name)) for name in dict.fromkeys((dense, key))]
+    if scenes[-1] is None:
+        return None
+    found = [scene for scene in scenes if scene is not None]
+    return frame.data(found if sum(len(scene["spz"]) for scene in found) <= FLIGHT_BYTES else found[-1:])
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _packed(path: Path) -> dict[str, str] | None:
     try:
-        flight = json.loads(read_text(path, FLIGHT_BYTES))
+        packed = json.loads(read_text(path, FLIGHT_BYTES + 10_000))
     except (OSError, ValueError, RecursionError):
         return None
-    keys = {"scenes", "views", "aspect", "up", "sure", "near", "background", "antialiased", "drag"}
-    scenes = flight["scenes"] if isinstance(flight, dict) and flight.keys() == keys else None
-    known = (
-        isinstance(scenes, list) and scenes and all(isinstance(s, dict) and type(s.get("spz")) is str for s in scenes)
-    )
-    return flight if known else None
+    known = isinstance(packed, dict) and packed.keys() == {"name", "amount", "spz"}
+    return packed if known and all(isinstance(text, str) for text in packed.values()) else None

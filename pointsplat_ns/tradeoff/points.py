@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,7 @@ class Point:
     key: str
     """Short name, unique in a sweep and fit for a file's name: ``dense``, ``10pct_sh3``, ``10pct_sh3_quick``."""
     label: str
-    """The same for people: ``10 %, repaired for 12 s``."""
+    """The same for people: ``10 %, repaired (quick)``."""
     command: str
     """The exact command that produces the scene; empty for the dense one."""
     by: str
@@ -33,7 +39,7 @@ class Point:
     gaussians: int
     sh_degree: int
     repair: str
-    """Kind of repair: ``none``, ``refiner``, ``quick``, ``thorough``."""
+    """Kind of repair, see :data:`~pointsplat_ns.tradeoff.settings.Repair`."""
     bytes: int
     """Size of the file."""
     against_dense: ImageMetrics
@@ -60,20 +66,52 @@ class Point:
     """Median time of one frame over views by the clock, in milliseconds; None if it was not measured."""
 
 
-class Speed(NamedTuple):
-    """Ratio of the dense scene's time of a frame to that of a point: median over views, and quartiles.
+def restored_point(values: dict[str, Any]) -> Point:
+    """The inverse of :func:`dataclasses.asdict` for a point that was written as JSON, where an infinite PSNR is null.
+    Errors are those of Python if the values are not those of a point."""
+    qualities = {name: _quality(values[name]) for name in ("against_dense", "against_photos")}
+    point = Point(**{**values, **qualities})
+    check_types(point)
+    return point
 
-    Example:
-        >>> print(Speed(2.13, 1.94, 2.31))
-        2.1 times as fast (1.9 to 2.3)
-    """
+
+def _quality(values: dict[str, Any] | None) -> ImageMetrics | None:
+    if values is None:
+        return None
+    quality = ImageMetrics(**{**values, "psnr": math.inf if values["psnr"] is None else values["psnr"]})
+    check_types(quality)
+    return quality
+
+
+def check_types(of: DataclassInstance) -> None:
+    """Raise a ValueError if a value of a record has another type than its field."""
+    for field in dataclasses.fields(of):
+        value, kind = getattr(of, field.name), str(field.type)
+        if not _FITS[kind.removesuffix(" | None")](value) and not (value is None and kind.endswith("None")):
+            raise ValueError(f"{field.name} is {value!r}")
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+_FITS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str),
+    "int": _is_count,
+    "float": lambda value: type(value) in (int, float) and not math.isnan(value),
+    "ImageMetrics": lambda value: isinstance(value, ImageMetrics),
+    "Point": lambda value: isinstance(value, Point),
+    "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
+}
+"""Whether a value fits the annotation of a field, by the annotation."""
+
+
+class Speed(NamedTuple):
+    """Ratio of the dense scene's time of a frame to that of a point: median over views, and quartiles."""
 
     median: float
     low: float
     high: float
-
-    def __str__(self) -> str:
-        return f"{self.median:.2g} times as fast ({self.low:.2g} to {self.high:.2g})"
 
 
 def speed_of(point: Point, dense: Point) -> Speed:
@@ -90,7 +128,7 @@ class Tradeoff:
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     options = {"points": 2, "views": 2, "resolution": "64x48"}
+        ...     options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
         ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
         >>> [point.key for point in found.points], found.point("10pct_sh1").gaussians
         (['dense', '10pct_sh1'], 30)
@@ -110,6 +148,8 @@ class Tradeoff:
     """Lines of text for the reader, such as on a busy machine or missing LPIPS."""
     times_trusted: bool = True
     """Whether no other program disturbed the timing."""
+    within: float = 0.5
+    """Largest loss of the recommended point against photos, dB."""
     recommended: str = ""
     """``key`` of the recommended point, or of the point found for targets."""
     why: str = ""
@@ -124,8 +164,3 @@ def picture_path(folder: Path, view: int, what: str) -> Path:
     """Path of the picture of a view, by its number from 0, in the folder of a sweep: of a point's ``key``, or of the
     ``photo``."""
     return folder / "pictures" / f"{view:02d}_{what}.png"
-
-
-def flight_path(folder: Path, key: str) -> Path:
-    """Path of a point's scene for flights in the page, in the folder of a sweep."""
-    return folder / "scenes" / f"{key}.json"

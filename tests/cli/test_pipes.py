@@ -50,7 +50,7 @@ def here(tmp_path, monkeypatch):
         ("a.safetensors", ("make-feedback", "room.ply", "--start", "a.safetensors"), "a.safetensors: no such file"),
         ("a.json", ("report", "a.json"), "a.json: cannot be read (not a regular file)"),
         ("out/pointsplat-scenes.json", ("compact", ".", "-o", "out"), "out: cannot be used (not a regular file)"),
-        ("out/points.json", ("tradeoff", "room.ply", "-o", "out"), "points.json: not the points of a sweep"),
+        ("out/tradeoff.json", ("tradeoff", "room.ply", "-o", "out"), "tradeoff.json: not the points of a sweep"),
         ("out/room0/cam_params.json", ("rooms", "-o", "out", "--seeds", "0"), "out/room0: "),
         ("b.ply", ("prune", *ROOM, "-o", "b.ply", "--force"), "b.ply: not a regular file"),
         ("a", ("prune", *ROOM, "-o", "/dev/stdout"), "/dev/stdout: cannot write a nameless file"),

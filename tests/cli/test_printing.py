@@ -12,7 +12,6 @@ from making import ball, box_room
 from pointsplat_ns.cli import main
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.tradeoff import machine, outputs
 
 COUNT = 60
 
@@ -64,9 +63,7 @@ def test_lod_and_tradeoff_print_their_files(ply, as_json, plain_page, no_lpips, 
     }
     views = sample_views(box_room(0, COUNT), 2, 24, 18)
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
-    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
-    few = ("--views", "2", "--repairs", "none", "--points", "2")
+    few = ("--views", "2", "--repairs", "none", "--keep", "10%")
     assert as_json("tradeoff", ply, *few) == {
         "output": "room_tradeoff",
         **json.loads(Path("room_tradeoff/tradeoff.json").read_text("utf-8")),

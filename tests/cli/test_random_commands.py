@@ -19,7 +19,6 @@ import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import COMMANDS, _command, main
 from pointsplat_ns.cli.help import STATUSES
-from pointsplat_ns.tradeoff import machine
 from pointsplat_ns.viewing.viewer import Viewer
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
@@ -29,7 +28,7 @@ SECONDS = 300
 
 FAST = {
     "compact": "--effort instant",
-    "tradeoff": "--points 2 --views 1 --repairs none",
+    "tradeoff": "--keep 10% --views 1 --repairs none",
     "tables": "--fine-tune 1 --views 1 --side 16 --keeps 0.5",
     "render": "--width 16 --height 12 --seconds 0.1",
 }
@@ -156,10 +155,9 @@ def hangs(number, frame):
 
 
 @pytest.fixture()
-def quick(monkeypatch, tmp_path):
-    """The viewer ends at once, and no other program on this machine is waited for."""
+def quick(monkeypatch):
+    """The viewer ends at once."""
     monkeypatch.setattr(Viewer, "wait", lambda self: None)
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     before = signal.signal(signal.SIGALRM, hangs)
     yield
     signal.signal(signal.SIGALRM, before)

@@ -11,7 +11,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.tradeoff import judging, machine, outputs
+from pointsplat_ns.tradeoff import judging
 
 FEW = ("--views", "2", "--repairs", "none")
 
@@ -23,12 +23,9 @@ def views():
 
 @pytest.fixture()
 def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
-    """A room of 400 Gaussians, looked at from three views; repairs take two steps, plots are none, and
-    times are as counts are."""
+    """A room of 400 Gaussians, looked at from three views; repairs take two steps, and times are as counts are."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
-    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
@@ -48,7 +45,6 @@ def refusal(capsys, *args) -> str:
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(error, ply, tmp_path, monkeypatch):
     def failing(*_):
-        assert list((folder / "pictures").glob("*dense.png")), "nothing was written yet"
         raise error("now")
 
     monkeypatch.setattr(judging, "_timed", failing)
@@ -56,7 +52,7 @@ def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(erro
         (tmp_path / "old" / "pictures").mkdir(parents=True, exist_ok=True)
         (tmp_path / "old" / "pictures" / "mine.png").touch()
         with pytest.raises(error):
-            ps.measure_tradeoff(ply, folder, points=2, views=2, repairs=("none",))
+            ps.measure_tradeoff(ply, folder, keep=("10%",), views=2, repairs=("none",))
     assert not (tmp_path / "new").exists()
     assert [path.name for path in (tmp_path / "old").rglob("*")] == ["pictures", "mine.png"]
 
@@ -74,7 +70,7 @@ def test_a_quality_is_reached_and_what_is_cheaper_is_said(ply, tmp_path, capsys)
     "arguments, said",
     [
         (("--target-db", "0"), "--target-db is 0; expected a positive number"),
-        (("--points", "1"), "1 points; expected at least 2"),
+        (("--keep", "much"), "keep is 'much'"),
         (("--by", "magic"), "no method is called 'magic'"),
         (("--within", "-1"), "a loss of -1 dB"),
     ],

@@ -107,7 +107,7 @@ def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
 
 def test_commands_of_a_sweep_of_sampled_views_say_so(trained_walls, tmp_path):
     run = run_of(trained_walls, "wall-a")
-    options = {"points": 2, "repairs": ("none",), "views": 2, "resolution": "64x48"}
+    options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
     ps.measure_tradeoff(run, tmp_path / "out", poses="none", **options)
-    points = (tmp_path / "out" / "points.json").read_text()
+    points = (tmp_path / "out" / "tradeoff.json").read_text()
     assert f"pointsplat prune {run} " in points and "--poses none" in points and "sampled" in points

@@ -20,7 +20,6 @@ from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, eps2d_of, 
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
-from pointsplat_ns.tradeoff import machine, outputs
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
 SEED = 20
@@ -116,9 +115,7 @@ def mean_psnr(scene: Gaussians, run: Path) -> float:
 
 
 def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
-    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-    found = ps.measure_tradeoff(run, tmp_path / "trade", points=2, repairs=("none",))
+    found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none",))
     dense, small = found.points
     assert dense.against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)
     assert small.against_photos is not None and small.gaussians < dense.gaussians
@@ -128,10 +125,8 @@ def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page
 
 
 def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, plain_page, no_lpips, monkeypatch):
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
-    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
     monkeypatch.setitem(PHOTO_STEPS, "quick", 96)
-    found = ps.measure_tradeoff(run, tmp_path / "trade", points=3, repairs=("none", "photos"))
+    found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none", "photos"))
     trained = next(point for point in found.points if point.repair == "photos")
     pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
     assert trained.against_photos.psnr > pruned.against_photos.psnr + 0.1
@@ -151,4 +146,4 @@ def test_photos_of_no_run_and_photos_beside_targets_are_refused_at_once(tmp_path
     ps.save(ps.example_room()[::200][:300], tmp_path / "room.ply")
     with pytest.raises(ps.PointSplatError, match=error):
         ps.measure_tradeoff(tmp_path / "room.ply", tmp_path / "trade", repairs=("none", "photos"), **options)
-    assert not (tmp_path / "trade" / "points.json").exists()
+    assert not (tmp_path / "trade" / "tradeoff.json").exists()

@@ -16,7 +16,6 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.running import has_finished, remove_interrupted
-from pointsplat_ns.tradeoff import machine
 from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
@@ -35,7 +34,6 @@ def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpo
 
 
 def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     (config,) = (trained_walls / "wall-b").rglob("config.yml")
     only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]

@@ -5,21 +5,18 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point
-from pointsplat_ns.tradeoff.settings import DENSE, Naming, Setting
+from pointsplat_ns.tradeoff.settings import DENSE, Setting
 
 
 def point(
     setting: Setting, psnr: float, ms: float = 10.0, photos: float | None = None, of: int = 100_000, key: str = ""
 ) -> Point:
     """A point with a PSNR against the dense scene and, if given, against photos."""
-    from pathlib import Path
-
-    naming = Naming(Path("room.ply"), "room", of, 3)
-    dense = setting.by == DENSE
+    dense, name = setting.by == DENSE, f"{100 * setting.count / of:g} %, SH {setting.sh_degree}, {setting.repair}"
     return Point(
-        key=key or (DENSE if dense else naming.key(setting)),
-        label=DENSE if dense else naming.label(setting),
-        command="" if dense else naming.command(setting),
+        key=key or (DENSE if dense else name),
+        label=DENSE if dense else name,
+        command="" if dense else f"make {name}",
         by=setting.by,
         share=setting.count / of,
         gaussians=setting.count,

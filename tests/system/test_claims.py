@@ -17,7 +17,7 @@ def test_a_lock_that_is_a_hard_link_leaves_its_file_as_it_was(tmp_path):
     target.write_text("precious")
     target.chmod(0o600)
     os.link(target, lock)
-    with claim(lock, mode=0o666) as held:
+    with claim(lock) as held:
         assert held
     assert target.read_text() == "precious" and target.stat().st_mode & 0o777 == 0o600
 
@@ -60,16 +60,6 @@ def test_whoever_waits_for_a_lock_that_is_removed_gets_the_new_one(tmp_path):
         assert not third
     leave.set()
     other.join()
-
-
-def test_the_mode_of_a_new_lock_is_the_one_asked_for(tmp_path):
-    before = os.umask(0o077)
-    try:
-        with claim(tmp_path / "ours"), claim(tmp_path / "all", mode=0o666):
-            pass
-    finally:
-        os.umask(before)
-    assert [(tmp_path / name).stat().st_mode & 0o777 for name in ("ours", "all")] == [0o600, 0o666]
 
 
 @pytest.mark.parametrize("kind", ["symbolic", "hard"])

@@ -10,7 +10,6 @@ from making import box_room
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff import machine, outputs
 from pointsplat_ns.tradeoff.measuring import Subject
 from pointsplat_ns.tradeoff.sweep import Sweep, SweepOptions
 from pointsplat_ns.views import Views
@@ -30,26 +29,16 @@ def room_views(room) -> Views:
     return sample_views(ps.load(room), 3, 48, 36)
 
 
-@pytest.fixture(autouse=True)
-def own_lock(tmp_path_factory, monkeypatch) -> None:
-    """Tests wait neither for one another nor for anything else on this machine."""
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path_factory.mktemp("lock") / "lock"), 0.0))
-
-
 @pytest.fixture()
-def plain_plots(monkeypatch) -> None:
-    """Files in place of plots, which take a second each."""
-    monkeypatch.setattr(outputs, "plot", lambda sweep, against, path: path.write_text(against))
-
-
-@pytest.fixture()
-def new_sweep(room, room_views, plain_page, plain_plots, no_lpips, monkeypatch) -> Callable[..., Sweep]:
-    """A function (folder, options) that begins a sweep of the room whose repairs take two steps."""
+def new_sweep(room, room_views, plain_page, no_lpips, monkeypatch) -> Callable[..., Sweep]:
+    """A function (folder, options) that begins a sweep of the room, to a tenth unless told otherwise, whose repairs
+    take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
 
-    def begin(folder: Path, held_out=None, progress=lambda what, share: None, **options) -> Sweep:
+    def begin(folder: Path, held_out=None, sha256="sum", **options) -> Sweep:
         dense = ps.load(room)
-        subject = Subject(dense, room, "room", "sum", lambda: ViewSource(dense, given=room_views), held_out)
-        return Sweep(subject, folder, SweepOptions(**options), progress)
+        subject = Subject(dense, room, "room", lambda: ViewSource(dense, given=room_views), held_out)
+        options = SweepOptions(**{"keep": ("10%",), "repairs": ("none",), **options})
+        return Sweep(subject, sha256, folder, options, lambda what, share: None)
 
     return begin

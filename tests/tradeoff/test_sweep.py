@@ -1,21 +1,26 @@
-"""Sweeps: what is kept of them whatever happens, and that their figures come out the same again."""
+"""Sweeps: the table, what is kept of it whatever happens, and that its commands make the same scenes."""
 
 import csv
 import json
 import math
+import shlex
+from pathlib import Path
 
 import pytest
 
 import pointsplat_ns as ps
+from making import same_bits
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression import repair
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.io.discovery import FOLDER_FILES
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff import measuring, sweep
-from pointsplat_ns.tradeoff.journal import check_journal_folder
-from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
+from pointsplat_ns.tradeoff import measuring
+from pointsplat_ns.tradeoff.measuring import Subject, make
 from pointsplat_ns.tradeoff.points import picture_path
-from pointsplat_ns.tradeoff.settings import Setting
+from pointsplat_ns.tradeoff.results import SWEEP_FILES, check_folder
+from pointsplat_ns.tradeoff.settings import REPAIRS, Setting
 from pointsplat_ns.tradeoff.sweep import SweepOptions
 
 
@@ -23,27 +28,40 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_sweep_leaves_tables_plots_pictures_and_a_page(new_sweep, tmp_path, plain_page, monkeypatch):
-    result = new_sweep(tmp_path, points=2).run()
+def test_a_sweep_leaves_a_table_pictures_scenes_and_a_page(new_sweep, tmp_path):
+    result = new_sweep(tmp_path).run()
     assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
-    assert names(tmp_path) == sorted([*SWEEP_FILES.every, FOLDER_FILES.sweep_points, "pictures", "scenes"])
+    assert names(tmp_path) == ["pictures", "scenes", "tradeoff.csv", "tradeoff.html", "tradeoff.json"]
     with (tmp_path / SWEEP_FILES.table).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["key"] for row in rows] == [point.key for point in result.points]
     assert float(rows[1]["against_dense_psnr"]) == result.points[1].against_dense.psnr
-    content = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert rows[1]["against_photos_psnr"] == "" and float(rows[0]["speed_median"]) == 1
+    content = json.loads((tmp_path / SWEEP_FILES.json).read_text())
     assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
     assert content["recommended"] == result.recommended
-    assert [(tmp_path / name).read_text() for name in SWEEP_FILES.plots.values()] == [*SWEEP_FILES.plots]
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
     assert (tmp_path / SWEEP_FILES.page).read_text().split() == [point.key for point in result.points]
 
 
-@pytest.mark.parametrize("after", [1, 2])
-def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_sweep, tmp_path, monkeypatch, after):
-    made, make = [], measuring.make
+def test_the_table_has_each_combination_once(room):
+    options = SweepOptions(("50%", 200, "10%"), ("merge", "opacity"), ("all", "0", "3"), ("quick", "none"))
+    settings = options.settings(ps.load(room))
+    wanted = {
+        Setting(count, degree, repair, by)
+        for count in (200, 40)
+        for degree in (0, 1)
+        for repair in ("none", "quick")
+        for by in ("merge", "opacity")
+    }
+    assert set(settings) == wanted and len(settings) == len(wanted)
+
+
+@pytest.mark.parametrize("after", [0, 2])
+def test_an_interrupted_sweep_keeps_what_it_measured_and_goes_on(new_sweep, tmp_path, monkeypatch, after):
+    made, keep = [], ("50%", "30%", "10%")
 
     def interrupted(dense, setting, *args):
         if len(made) == after:
@@ -53,15 +71,14 @@ def test_an_interruption_leaves_what_was_measured_and_the_next_call_goes_on(new_
 
     monkeypatch.setattr(measuring, "make", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        new_sweep(tmp_path, points=4, repairs=("none",)).run()
-    content = json.loads((tmp_path / "tradeoff.json").read_text())
-    assert len(content["points"]) == 1 + after
-    assert any("interrupted" in note for note in content["notes"])
+        new_sweep(tmp_path, keep=keep).run()
+    content = json.loads((tmp_path / SWEEP_FILES.json).read_text())
+    assert len(content["points"]) == 1 + after and any("interrupted" in note for note in content["notes"])
     made.clear()
     monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
-    resumed = new_sweep(tmp_path, points=4, repairs=("none",)).run()
+    resumed = new_sweep(tmp_path, keep=keep).run()
     assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
-    whole = new_sweep(tmp_path / "whole", points=4, repairs=("none",)).run()
+    whole = new_sweep(tmp_path / "whole", keep=keep).run()
     assert [(p.key, p.against_dense) for p in resumed.points] == [(p.key, p.against_dense) for p in whole.points]
     assert not any("interrupted" in note for note in resumed.notes)
 
@@ -70,72 +87,134 @@ def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkey
     from pointsplat_ns.compression import compact
 
     monkeypatch.setattr(compact, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True))
-    running = new_sweep(tmp_path)
-    running.measure_dense()
     with pytest.raises(KeyboardInterrupt):
-        running.measure(Setting(40, 1, "quick"))
-    assert running.journal.points == {}
+        new_sweep(tmp_path, repairs=("quick",)).run()
+    assert len(json.loads((tmp_path / SWEEP_FILES.json).read_text())["points"]) == 1
 
 
 def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
-    running = new_sweep(tmp_path, points=2)
-    [_, first] = running.run().points
+    [_, first] = new_sweep(tmp_path).run().points
     picture_path(tmp_path, 1, first.key).unlink()
-    [_, again] = new_sweep(tmp_path, points=2).run().points
-    assert picture_path(tmp_path, 1, first.key).is_file()
-    assert again.against_dense == first.against_dense
+    [_, again] = new_sweep(tmp_path).run().points
+    assert picture_path(tmp_path, 1, first.key).is_file() and again.against_dense == first.against_dense
 
 
 def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
-    photos = list(ps.render(ps.load(room), room_views))
-    photos = [(photo + 0.05).clamp(0, 1) for photo in photos]
-    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), points=2, views=2).run()
-    assert result.views_origin == "held-out photos of the dataset"
-    assert all(point.against_photos is not None for point in result.points)
+    photos = [(photo + 0.05).clamp(0, 1) for photo in ps.render(ps.load(room), room_views)]
+    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), views=2).run()
+    assert result.views_origin == "held-out photos of the dataset" and "held-out photos" in result.why
     assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
+    assert result.points[1].against_photos is not None
     assert len(list((tmp_path / "pictures").glob("*_photo.png"))) == 2
-    assert "held-out photos" in result.why
 
 
-def test_where_photos_cannot_be_had_it_says_why_and_goes_on_without(new_sweep, tmp_path):
+def test_photos_that_cannot_be_had_are_named_and_left_out(new_sweep, tmp_path):
     def gone(count):
         raise DataError("photo_3.jpg: no such file")
 
-    result = new_sweep(tmp_path, gone, points=2).run()
+    result = new_sweep(tmp_path, gone).run()
     assert result.points[1].against_photos is None and result.views_origin == "given views"
     assert "there are no held-out photos: photo_3.jpg: no such file" in result.notes
 
 
-def test_points_of_another_scene_are_refused_before_anything_is_measured(new_sweep, tmp_path, room, room_views):
-    new_sweep(tmp_path, points=2).run()
-    dense = ps.load(room)
-    other = measuring.Subject(dense, room, "room", "another sum", lambda: ViewSource(dense, given=room_views))
-    with pytest.raises(SceneError, match="its points are of another sweep"):
-        sweep.Sweep(other, tmp_path, SweepOptions(), lambda what, share: None)
+@pytest.fixture(scope="module")
+def content(tmp_path_factory, room, room_views) -> dict:
+    """The JSON of a sweep of the room."""
+    from pointsplat_ns.tradeoff.points import Tradeoff
+    from pointsplat_ns.tradeoff.results import write_points
+    from pointsplat_ns.tradeoff.settings import DENSE
+    from trades import point
+
+    folder, points = tmp_path_factory.mktemp("json"), (point(Setting(400, 1, by=DENSE), math.inf, of=400),)
+    write_points(Tradeoff("room", "m", "v", 48, 36, (*points, point(Setting(40, 1), 31.25, photos=27.5))), {}, folder)
+    return json.loads((folder / SWEEP_FILES.json).read_text())
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda content: content["points"][1].update(gaussians="many"), "gaussians is 'many'"),
+        (lambda content: content["points"][1].update(gaussians=-1), "gaussians is -1"),
+        (lambda content: content["points"][1].update(frame_ms=math.nan), "frame_ms is nan"),
+        (lambda content: content["points"][1]["against_photos"].update(ssim="good"), "ssim is 'good'"),
+        (lambda content: content["points"][1].update(repair="magic"), "repairs are magic"),
+        (lambda content: content["points"][1].update(by="magic"), "no method is called 'magic'"),
+        (lambda content: content["points"][1].pop("key"), "key"),
+        (lambda content: content.pop("points"), "lacks 'points'"),
+        (lambda content: content["points"].append(None), "not iterable"),
+        (lambda content: content.update(version=3), "of version 3, this program's are of 4"),
+        *((text, "") for text in ("", "[]", "null", "[" * 100_000, "\x00\xff")),
+    ],
+)
+def test_a_json_of_something_else_is_refused_in_one_line(new_sweep, tmp_path, content, change, said):
+    content = json.loads(json.dumps(content))
+    if not isinstance(change, str):
+        change(content)
+    (tmp_path / SWEEP_FILES.json).write_text(change if isinstance(change, str) else json.dumps(content))
+    with pytest.raises(SceneError, match=f"tradeoff.json: not the points of a sweep .*{said}.*--force") as refused:
+        new_sweep(tmp_path)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_points_of_another_scene_are_refused_and_keys_are_not_taken_from_files(new_sweep, tmp_path):
+    new_sweep(tmp_path).run()
+    with pytest.raises(SceneError, match="its points are of another sweep .scene: 'sum', now 'another'"):
+        new_sweep(tmp_path, sha256="another")
+    path = tmp_path / SWEEP_FILES.json
+    path.write_text(path.read_text().replace('"key": "10pct_sh1"', '"key": "../../away"'))
+    assert {point.key for point in new_sweep(tmp_path).points.values()} == {"dense", "10pct_sh1"}
 
 
 def test_results_without_points_are_not_overwritten(tmp_path):
     (tmp_path / SWEEP_FILES.table).write_text("precious")
-    with pytest.raises(SceneError, match="exists already, without points.json"):
-        check_journal_folder(
-            tmp_path, FOLDER_FILES.sweep_points, SWEEP_FILES.every, False, [tmp_path / SWEEP_FILES.table]
-        )
-    check_journal_folder(tmp_path, FOLDER_FILES.sweep_points, SWEEP_FILES.every, True, [tmp_path / SWEEP_FILES.table])
-    assert names(tmp_path) == []
+    with pytest.raises(SceneError, match="exists already, without tradeoff.json"):
+        check_folder(tmp_path)
 
 
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"points": 1}, "1 points; expected at least 2"),
-        ({"within": 0.0}, "a loss of 0 dB"),
+        ({"keep": ("much",)}, "keep is 'much'"),
+        ({"keep": ()}, "no budget or no method"),
+        ({"by": ()}, "no budget or no method"),
+        ({"by": ("magic",)}, "no method is called 'magic'"),
+        ({"sh": ("4",)}, "sh is 4"),
         ({"within": math.nan}, "a loss of nan dB"),
         ({"views": 0}, "0 views"),
-        ({"methods": ()}, "no method is named"),
-        ({"methods": ("magic",)}, "no method is called 'magic'"),
-        ({"repairs": ("magic",)}, "repairs are magic"),
+        ({"repairs": ("magic",)}, "repairs are magic; expected some of none, refiner, quick, thorough"),
+        ({"repairs": ()}, "repairs are empty"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, said):
     with pytest.raises(PointSplatError, match=said):
         SweepOptions(**options)
+
+
+SETTINGS = [Setting(40, 1), Setting(40, 1, "refiner"), Setting(40, 0, "quick", "paper"), Setting(40, 1, by="coverage")]
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: f"{setting.count} {setting.repair} {setting.by}")
+def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, tmp_path, monkeypatch):
+    monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setattr(view_source.Sampler, "views", lambda *args, **options: room_views)
+    monkeypatch.chdir(tmp_path)
+    path, dense = Path("the room.ply"), ps.load(room)
+    path.write_bytes(room.read_bytes())
+    subject = Subject(dense, path, "room", lambda: ViewSource(dense))
+    made = make(dense, setting, subject.new_views, lambda what, share: None)
+    assert (len(made.scene), made.scene.sh_degree) == (setting.count, setting.sh_degree)
+    program, *words = shlex.split(subject.names(setting)["command"])
+    assert program == "pointsplat"
+    main(words)
+    written = Path(f"room_{subject.names(setting)['key']}.ply")
+    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == setting.bytes
+
+
+def test_keys_differ_and_fit_into_names_of_files(room):
+    subject = Subject(ps.load(room), room, "room", lambda: None)
+    repairs = [Setting(40, 1, repair) for repair in REPAIRS]
+    keys = [
+        subject.names(s)["key"] for s in (*repairs, Setting(40, 0), Setting(41, 1), Setting(40, 1, by="log-volume"))
+    ]
+    assert len(set(keys)) == len(keys)
+    assert all(character.isalnum() or character in "._-" for key in keys for character in key)

@@ -18,7 +18,6 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
-from pointsplat_ns.tradeoff import machine
 
 
 @pytest.fixture()
@@ -53,9 +52,8 @@ def room_views() -> ps.Views:
 @pytest.fixture()
 def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
-    none. Tests wait neither for one another nor for anything else on this machine."""
+    none."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
     monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")

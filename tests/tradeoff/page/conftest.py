@@ -8,12 +8,17 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.tradeoff.page import keep_flight, write_sweep_page
-from pointsplat_ns.tradeoff.points import Tradeoff, flight_path
+from pointsplat_ns.tradeoff.page import flight_beside, keep_scene, write_sweep_page
+from pointsplat_ns.tradeoff.points import Tradeoff
 from sweeps import measured_room, room_views
 
 FLOWN = "0.1_coverage"
 """Key of the one point whose scene is kept to fly through. No point is recommended."""
+
+
+def frame() -> FlightFrame:
+    """The frame of flights through the room."""
+    return FlightFrame.of(ps.example_room(), room_views())
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +27,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tradeoff, Path]:
     folder = tmp_path_factory.mktemp("sweep")
     room = ps.example_room()
     measured = measured_room(folder, room)
-    assert keep_flight(FlightFrame.of(room, room_views()), room[::10], "a tenth", flight_path(folder, FLOWN))
+    keep_scene(frame(), room[::10], measured.point(FLOWN), folder)
     # The one that opacity chose is slower and worse than the larger one.
     times = [95.0 if p.by == "opacity" else 100 * p.share for p in measured.points]
     timed = [
@@ -38,6 +43,7 @@ def make_page(sweep, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., 
 
     def make(**replaced) -> Path:
         measured, folder = sweep
-        return write_sweep_page(replace(measured, **replaced), folder, tmp_path_factory.mktemp("page") / "trade.html")
+        measured, output = replace(measured, **replaced), tmp_path_factory.mktemp("page") / "trade.html"
+        return write_sweep_page(measured, folder, output, flight_beside(frame(), folder, "dense", measured.recommended))
 
     return make

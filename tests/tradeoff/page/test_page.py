@@ -19,7 +19,7 @@ from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
 from pointsplat_ns.tradeoff.page import write_sweep_page
-from pointsplat_ns.tradeoff.points import flight_path, picture_path
+from pointsplat_ns.tradeoff.points import picture_path
 from sweeps import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
@@ -75,8 +75,8 @@ def test_the_recommended_scene_is_in_the_page_to_fly_through(make_page, sweep, w
     path = make_page(recommended="0.1_coverage")
     parts = parts_of(path)
     [scene] = parts.data["flight"]["scenes"]
-    assert scene["name"] == "a tenth" and len(scene["spz"]) > 50_000 and len(parts.data["flight"]["views"]) == 2
-    assert "Fly through: a tenth" in path.read_text("utf-8")
+    assert scene["name"] == "10 %, coverage" and len(scene["spz"]) > 50_000 and len(parts.data["flight"]["views"]) == 2
+    assert "Fly through: 10 %, coverage" in path.read_text("utf-8")
     names_nothing_outside(path)
     assert policy_of(parts)["worker-src"] == "blob:" and "worker-src" not in policy_of(parts_of(written))
     assert path.stat().st_size < 10_000_000
@@ -86,31 +86,27 @@ def test_the_recommended_scene_is_in_the_page_to_fly_through(make_page, sweep, w
 
 def test_the_dense_scene_is_beside_the_recommended_one_if_both_fit(sweep, tmp_path, monkeypatch):
     measured, folder = sweep
-    shutil.copytree(folder, tmp_path / "copy")
+    shutil.copytree(folder / "scenes", tmp_path / "scenes")
     room = ps.example_room()
-    page.keep_flight(FlightFrame.of(room, room_views()), room[::5], "dense", flight_path(tmp_path / "copy", "dense"))
+    frame, dense = FlightFrame.of(room, room_views()), measured.points[0]
 
     def names(recommended: str) -> list[str]:
-        page = write_sweep_page(replace(measured, recommended=recommended), tmp_path / "copy", tmp_path / "page.html")
-        return [scene["name"] for scene in parts_of(page).data["flight"]["scenes"]]
+        return [scene["name"] for scene in page.flight_beside(frame, tmp_path, "dense", recommended)["scenes"]]
 
-    assert names("0.1_coverage") == ["dense", "a tenth"] and names("dense") == ["dense"]
-    size = flight_path(tmp_path / "copy", "dense").stat().st_size
-    monkeypatch.setattr(page, "FLIGHT_BYTES", size)
-    assert names("0.1_coverage") == ["a tenth"] and names("dense") == ["dense"]
+    page.keep_scene(frame, room[::5], dense, tmp_path)
+    assert names("0.1_coverage") == ["dense", "10 %, coverage"] and names("dense") == ["dense"]
+    monkeypatch.setattr(page, "FLIGHT_BYTES", (tmp_path / "scenes" / "dense.json").stat().st_size)
+    assert names("0.1_coverage") == ["10 %, coverage"] and names("dense") == ["dense"]
+    (tmp_path / "scenes" / "dense.json").write_text('{"scenes": 1}')
+    assert page.flight_beside(frame, tmp_path, "dense", "dense") is None
 
 
-def test_scenes_that_take_too_much_of_a_page_are_not_kept(tmp_path, monkeypatch):
-    room = thinned(ps.example_room(), 3000)
-    stage, path = FlightFrame.of(room, room_views()), tmp_path / "new" / "scene.json"
-    monkeypatch.setattr(page, "FLIGHT_BYTES", 15_000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
-    assert not page.keep_flight(stage, room, "room", path) and not path.parent.exists()
-    monkeypatch.setattr(page, "FLIGHT_BYTES", 60_000)
-    assert not page.keep_flight(stage, room, "room", path) and not path.parent.exists()
-    monkeypatch.setattr(page, "FLIGHT_BYTES", 120_000)
-    assert page.keep_flight(stage, room, "room", path) and page.read_flight_beside(path, path)["drag"] == "look"
-    monkeypatch.setattr(page, "FLIGHT_BYTES", 60_000)
-    assert page.read_flight_beside(path, path) is None
+@pytest.mark.parametrize("most, kept", [(15_000, False), (60_000, False), (120_000, True)])
+def test_scenes_that_take_too_much_of_a_page_are_not_kept(sweep, tmp_path, monkeypatch, most, kept):
+    room = thinned(ps.example_room(), 3000)  # its PLY has 330 kB, and its SPZ in base64 80 kB
+    monkeypatch.setattr(page, "FLIGHT_BYTES", most)
+    page.keep_scene(FlightFrame.of(room, room_views()), room, sweep[0].points[0], tmp_path)
+    assert (tmp_path / "scenes" / "dense.json").exists() == kept
 
 
 def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
@@ -123,8 +119,6 @@ def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
         write_sweep_page(measured, broken, tmp_path / "page.html")
     with pytest.raises(DataError, match="no such file; expected pictures of at least one view"):
         write_sweep_page(measured, tmp_path / "nowhere", tmp_path / "page.html")
-    with pytest.raises(DataError, match="nothing was measured"):
-        write_sweep_page(replace(measured, points=()), folder, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 

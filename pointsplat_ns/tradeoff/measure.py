@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,11 @@ from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_f
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.io.scene import save
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.sizes import parse_resolution
+from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import (
@@ -24,14 +24,16 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import (
     need_named_data,
     training_photos,
 )
+from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.journal import check_journal_folder
 from pointsplat_ns.tradeoff.measuring import Subject
-from pointsplat_ns.tradeoff.outputs import SWEEP_FILES
 from pointsplat_ns.tradeoff.points import Tradeoff
-from pointsplat_ns.tradeoff.sweep import Sweep, SweepOptions, removed_without_points
-from pointsplat_ns.tradeoff.targets import TargetSearch, targets_of
+from pointsplat_ns.tradeoff.results import check_folder
+from pointsplat_ns.tradeoff.search import TargetSearch
+from pointsplat_ns.tradeoff.settings import check_repairs, whole_of
+from pointsplat_ns.tradeoff.sweep import KEEP, Sweep, SweepOptions
+from pointsplat_ns.tradeoff.targets import Targets, targets_of
 from pointsplat_ns.views import Views
 
 
@@ -40,9 +42,10 @@ def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,
     *,
-    points: int = 12,
+    keep: Sequence[Keep | str] | None = None,
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
+    sh: tuple[str, ...] = ("all",),
     repairs: tuple[str, ...] = ("none", "quick"),
     views: int = VIEW_COUNTS.compared,
     poses: str | Path | None = None,
@@ -57,18 +60,18 @@ def measure_tradeoff(
 ) -> Tradeoff:
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
-    It measures where the front bends and stops where it is flat (:mod:`~pointsplat_ns.tradeoff.walk` has the rule). Or,
-    with targets, it searches for the cheapest scene that meets all of them and writes it; among limits of time and size
-    alone, for the best one within them. Each point is saved as soon as it is measured: the same call goes on after an
-    interruption. Measurements on one machine wait for one another.
+    It measures each method, SH degree and repair at each budget. Or, with targets, it searches for the cheapest scene
+    that meets all of them and writes it; among limits of time and size alone, for the best one within them. Each point
+    is saved as soon as it is measured: the same call goes on after an interruption.
 
     Args:
         scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.
-        folder: where points, pictures, tables, plots, the page and the found scene go.
-        points: largest number of scenes of a sweep, the dense one among them.
+        folder: where points, pictures, the table, the page and the found scene go.
+        keep: budgets, as for :func:`pointsplat_ns.prune`, but for a PSNR; by default six from 70 % to 5 %.
         within: the recommended point is the fastest that loses at most so much, dB: against photos, or as much as is
             expected of its renders (:mod:`~pointsplat_ns.tradeoff.front`).
-        by: methods, as for :func:`pointsplat_ns.prune`; the first one is walked, others are measured at three budgets.
+        by: methods, as for :func:`pointsplat_ns.prune`; a search uses the first one.
+        sh: SH degrees: "all" for all bands, a digit for those up to a degree.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and
             "photos", its training on the photos of a run.
         views: largest number of views; without photos at most 12.
@@ -81,13 +84,13 @@ def measure_tradeoff(
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
         force: start over, and overwrite results in the folder.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
+        progress: True shows a bar; a function is called with the task and its share done.
 
     Returns:
         Every point of the folder, and the recommended or found one: see :class:`Tradeoff`.
 
     Raises:
-        BudgetError: if no scene meets the targets, or they mean nothing.
+        BudgetError: if no scene meets the targets, or a budget or a target means nothing.
         SceneError: if the scene or the folder is not usable, or the folder holds points of another sweep.
         DataError: if there is no view, or most of those of ``poses`` see nothing of the scene.
         PointSplatError: if there is no such method or repair, or a number means nothing.
@@ -103,58 +106,65 @@ def measure_tradeoff(
         >>> found.point(found.recommended).bytes <= 10_000
         True
     """
-    options = SweepOptions(points, within, tuple(by), tuple(repairs), views)
+    options = SweepOptions(KEEP if keep is None else tuple(keep), tuple(by), tuple(sh), tuple(repairs), within, views)
     on_photos = "photos" in options.repairs
-    targets = targets_of(target_db, target_ms, target_mb, photos=on_photos)
-    size, upward = parse_resolution(resolution), up_named(up)
+    targets = targets_of(target_db, target_ms, target_mb, keep, " ".join(sh), photos=on_photos)
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
-    with claimed_folder(folder), removed_without_points(folder), progress_bar(progress) as report:
-        dense, given, file = read_found(path, poses)
-        results = SWEEP_FILES.every
-        check_journal_folder(
-            folder,
-            FOLDER_FILES.sweep_points,
-            results,
-            force,
-            [folder / name for name in (FOLDER_FILES.sweep_points, *results)],
-        )
-        sampled = without_poses(poses)
-        subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
-        training = training_photos(path, data) if on_photos else None
-        if training is not None:
-            check_photos(dense, training, path)
-        subject = replace(
-            subject,
-            path=path,
-            name=name_of(path),
-            sha256=source_file(path).sha256,
-            poses=Path(NO_POSES) if sampled else file,
-            training=training,
-        )
-        sweep = Sweep(subject, folder, options, report)
-        if targets is None:
-            return sweep.run()
-        sweep.measure_dense()
+    with claimed_folder(folder), progress_bar(progress) as report:
+        if not force:
+            check_folder(folder)
+        subject = _subject_at(path, poses, resolution, up, data)
+        if on_photos:
+            training = training_photos(path, data)
+            check_photos(subject.dense, training, path)
+            subject = replace(subject, training=training)
+        sweep = Sweep(subject, source_file(path).sha256, folder, options, report, force)
+        return sweep.run() if targets is None else _search(sweep, targets, force)
+
+
+def _search(sweep: Sweep, targets: Targets, force: bool) -> Tradeoff:
+    """Measure what a search for targets asks for, and write the found scene beside the results."""
+    options, measurer = sweep.options, sweep.measurer
+    whole, repairs = whole_of(measurer.dense, options.by[0]), check_repairs(options.repairs)
+    with sweep.finished_early():
+        sweep.measure(sweep.dense)
+        search = TargetSearch(targets, whole, repairs, sweep.measure, measurer.cut_psnr, measurer.judged_views.where)
         try:
-            found = TargetSearch(
-                targets, sweep.plan, sweep.measure, sweep.measurer.cut_psnr, sweep.measurer.judged_views.where
-            ).run()
+            found = search.run()
         except BudgetError:
             sweep.finish()  # what was measured on the way
             raise
-        except (KeyboardInterrupt, SystemExit):
-            sweep.finish_early()
-            raise
-        output = folder / f"{subject.name}_{found.point.key}.ply"
-        if not output.exists() or force:
-            save(sweep.scene(found.setting), output)
-        return sweep.finish(found.point, f"{found.why}; written to {output}")
+    output = sweep.folder / f"{sweep.subject.name}_{found.point.key}.ply"
+    if not output.exists() or force:
+        save(sweep.scene(found.setting), output)
+    return sweep.finish(found.point, f"{found.why}; written to {output}")
+
+
+def _subject_at(
+    path: Path,
+    poses: str | Path | None,
+    resolution: tuple[int, int] | str | None,
+    up: str | None,
+    data: str | Path | None,
+) -> Subject:
+    """The scene at a path, with the options on views that its commands repeat."""
+    size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
+    dense, given, file = read_found(path, poses)
+    subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
+    named = {
+        "--poses": NO_POSES if sampled else file,
+        "--resolution": None if size is None else size_text(size),
+        "--data": data,
+    }
+    words = [word for option, value in named.items() if value is not None for word in (option, str(value))]
+    words += [] if up is None else [f"--up={up}"]
+    return replace(subject, path=path, name=name_of(path), words=tuple(words))
 
 
 def subject_of(
     dense: Gaussians,
-    path: Path | None,
+    run: Path | None,
     views: Views | None = None,
     refiner: TrainedRefiner | None = None,
     suffix: str = ".ply",
@@ -166,7 +176,8 @@ def subject_of(
 
     Args:
         dense: the scene.
-        path: where it was read from, or the run whose dataset has the poses; None if it is in memory only.
+        run: the file or folder whose dataset may have the poses and photos; None if it is in memory only, or views are
+            to be sampled.
         views: given ones, in place of any others; there are no photos of them.
         refiner: what repairs begin with; by default nothing, and the one that ships where it repairs alone.
         suffix: of the format that smaller scenes are written in.
@@ -174,16 +185,15 @@ def subject_of(
         data: where the data of the run is now, if it moved.
     """
     read = functools.partial(dataset_views, data=data)
-    has_photos = path is not None and views is None and may_be_run(path)
+    held_out = None
+    if run is not None and views is None and may_be_run(run):
+        held_out = functools.partial(dataset_photos, run, "test", data=data)
     return Subject(
         dense=dense,
-        path=path or Path("scene.ply"),
+        path=run or Path("scene.ply"),
         name="scene",
-        sha256="",
-        new_views=lambda: ViewSource(dense, views, path, read, resolution, up=up),
-        held_out=functools.partial(dataset_photos, path, "test", data=data)
-        if path is not None and has_photos
-        else None,
+        new_views=lambda: ViewSource(dense, views, run, read, resolution, up=up),
+        held_out=held_out,
         refiner=refiner,
         suffix=suffix,
         resolution=resolution,
