@@ -1,12 +1,11 @@
-"""Clocks, memory, and slopes over sizes."""
+"""Clocks and memory."""
 
 from __future__ import annotations
 
 import ctypes
-import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -102,18 +101,3 @@ def status_bytes(field: str) -> int:
         if line.startswith(field + ":"):
             return 1024 * int(line.split()[1])
     raise OSError(f"/proc/self/status has no {field}")
-
-
-def slope(xs: Sequence[float], ys: Sequence[float | None]) -> float | None:
-    """Least-squares slope of log y over log x: 1 where y is linear in x.
-
-    Pairs that are not positive are left out; None where what remains does not even double x.
-
-    >>> round(slope([100, 200, 400], [1.0, 2.0, 4.0]), 6)
-    1.0
-    """
-    points = [(math.log(x), math.log(y)) for x, y in zip(xs, ys, strict=True) if y is not None and min(x, y) > 0]
-    u, v = [x for x, _ in points], [y for _, y in points]
-    if not points or max(u) - min(u) < math.log(2):
-        return None
-    return statistics.linear_regression(u, v).slope

@@ -111,7 +111,9 @@ def draw(session: Path, count: int, seed: int) -> None:
     with closing(sqlite3.connect(session)) as database, database:
         within = "definition_name IS NOT NULL AND job_id NOT IN (SELECT job_id FROM work_results)"
         order = "module_path, start_pos_row, start_pos_col, operator_name, occurrence"
-        jobs = [job for (job,) in database.execute(f"SELECT job_id FROM mutation_specs WHERE {within} ORDER BY {order}")]
+        jobs = [
+            job for (job,) in database.execute(f"SELECT job_id FROM mutation_specs WHERE {within} ORDER BY {order}")
+        ]
         drawn = random.Random(seed).sample(jobs, min(count, len(jobs)))
         for table in ("work_results", "mutation_specs", "work_items"):
             database.execute(f"DELETE FROM {table} WHERE job_id NOT IN ({','.join('?' * len(drawn))})", drawn)
