@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.tradeoff.points import ImageMetrics
-from pointsplat_ns.tradeoff.settings import DENSE, Repair
 
 
 @dataclass(frozen=True)
@@ -89,8 +87,8 @@ class Way:
     """Whether the scene is fine-tuned against its training photos."""
     network: Network | None = None
     """The refiner; None for none."""
-    repair: Repair = "none"
-    """Effort of ``compact``."""
+    repaired: bool = False
+    """Whether ``compact`` makes it."""
     mode: int | None = None
     """Index of splat-transform's mode; None for other ways."""
 
@@ -99,7 +97,7 @@ class Way:
 class Ways:
     """All ways, and the rows that the tables have of them. A star in a label marks ways without fine-tuning."""
 
-    dense: Way = Way(DENSE, "3DGS (dense)")
+    dense: Way = Way("dense", "3DGS (dense)")
 
     # The paper's, by images of the scene.
     lightgaussian: Way = Way("lightgaussian", "LightGaussian*", "lightgaussian")
@@ -116,7 +114,7 @@ class Ways:
 
     # The defaults of this package's commands.
     merge: Way = Way("merge", "merge (our default)", "merge")
-    compact: Way = Way("compact", "compact", "merge", repair="quick")
+    compact: Way = Way("compact", "compact", "merge", repaired=True)
 
     # The modes of another program.
     splat_transform: Way = Way("splat-transform", "splat-transform", mode=0)
@@ -250,14 +248,14 @@ _PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica, by table, way and share."""
 
 
-def published(table: int, dataset: str, way: str, share: float) -> ImageMetrics | None:
-    """The paper's figures of a row, by its way and share, against held-out photos in table 1, 3 or 4; None if there are
-    none.
+def published(table: int, dataset: str, way: str, share: float) -> tuple[float, float, float] | None:
+    """The paper's PSNR (dB), SSIM and LPIPS of a row, by its way and share, against held-out photos in table 1, 3 or 4;
+    None if there are none.
 
     Example:
         >>> published(1, "Replica", "pointsplat", 0.1)
-        ImageMetrics(psnr=29.81, ssim=0.902, lpips=0.276)
+        (29.81, 0.902, 0.276)
     """
     figures = _PUBLISHED[table].get((way, share), ())
-    found = {"ScanNet++": figures[:3], "Replica": figures[3:]}.get(dataset)
-    return ImageMetrics(*found) if found else None
+    first = {"ScanNet++": 0, "Replica": 3}.get(dataset, len(figures))
+    return figures[first : first + 3] or None  # type: ignore[return-value]
