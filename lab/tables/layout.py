@@ -236,7 +236,7 @@ class Layout:
             return [*found, _worst(same)]
 
         def more(cell: Cell) -> list[str]:
-            known = theirs[cell] or (None, None)
+            known = (theirs[cell] or (None, None))[:2]
             return [_text(write, value) for write, value in zip(METRICS.values(), known, strict=False)]
 
         return self._table(which, title, first, heads, rows, figures, more if any(theirs.values()) else None)
@@ -354,9 +354,9 @@ def escaped(text: str) -> str:
 def markdown_table(table: Table) -> str:
     """A table in Markdown, with its title above and its notes below."""
     name = f"Table {table.number}. " if table.number else ""
-    rows = [list(map(escaped, row)) for row in table.rows]
+    header, *rows = (list(map(escaped, row)) for row in (table.header, *table.rows))
     notes = "\n".join(f"- {escaped(note)}" for note in table.notes)
-    return "\n\n".join([f"**{name}{escaped(table.title)}**", markdown(table.header, rows), *([notes] if notes else [])])
+    return "\n\n".join([f"**{name}{escaped(table.title)}**", markdown(header, rows), *([notes] if notes else [])])
 
 
 def latex_table(table: Table) -> str:

@@ -9,7 +9,8 @@ import torch
 
 import peers
 import pointsplat_ns as ps
-from lab.tables import outputs
+from lab.tables import layout
+from lab.tables.layout import Tables
 from lab.tables.measure import measure_tables
 from lab.tables.ways import Ways
 from making import box_room
@@ -18,7 +19,6 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
-from pointsplat_ns.tradeoff import machine
 
 
 @pytest.fixture()
@@ -53,17 +53,16 @@ def room_views() -> ps.Views:
 @pytest.fixture()
 def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
-    none. Tests wait neither for one another nor for anything else on this machine."""
+    none."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
-    monkeypatch.setattr(machine, "LOCK", machine.MeasuringLock(str(tmp_path / "lock"), pause=0.0))
-    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
 
 
 @pytest.fixture()
-def measured(room, tmp_path) -> Callable[..., list]:
+def measured(room, tmp_path) -> Callable[..., Tables]:
     """A function that measures the room's tables in a folder, at 30 %, with two steps of fine-tuning."""
 
     def measure(*scenes: Path, folder: Path = tmp_path / "tables", **options):
