@@ -45,14 +45,10 @@ class Network:
     use_position: bool = True
 
     def __str__(self) -> str:
-        names = {"dual": "dual encoder", "concat": "concat encoder"}
-        without = [
-            text
-            for used, text in ((self.use_appearance, "appearance branch"), (self.use_position, "position encoding"))
-            if not used
-        ]
-        words = names[self.encoder] + (f" without {' and '.join(without)}" if without else "")
+        parts = {"appearance branch": self.use_appearance, "position encoding": self.use_position}
+        without = " and ".join(part for part, used in parts.items() if not used)
         weight = "" if self.opacity_weight is None else f", lambda {self.opacity_weight:g}"
+        words = f"{self.encoder} encoder" + (f" without {without}" if without else "")
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
     def command(self, share: float) -> str:
@@ -133,9 +129,16 @@ class Ways:
 
     @property
     def table_3(self) -> tuple[tuple[float, Way], ...]:
-        """Lambda and way of each row of Table 3."""
-        weights = PROTOCOL.opacity_weights
-        return tuple((weight, way(weight)) for weight in weights for way in (self.selected, self.refined))
+        """Lambda and way of each row of Table 3: the paper's selection, and refined."""
+        found: list[tuple[float, Way]] = []
+        for weight in PROTOCOL.opacity_weights:
+            selected, refined = self.paper, self.pointsplat
+            if weight != DEFAULT_OPACITY_WEIGHT:
+                network = Network(opacity_weight=weight)
+                selected = Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
+                refined = Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
+            found += [(weight, selected), (weight, refined)]
+        return tuple(found)
 
     @property
     def table_4(self) -> tuple[Way, ...]:
@@ -152,19 +155,6 @@ class Ways:
         """Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
         smaller = (self.lightgaussian, self.pup, self.paper, self.merge)
         return ((self.dense, 1.0), *((way, PROTOCOL.figure_share) for way in smaller))
-
-    def selected(self, weight: float) -> Way:
-        """The paper's selection at a lambda."""
-        if weight == DEFAULT_OPACITY_WEIGHT:
-            return self.paper
-        return Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
-
-    def refined(self, weight: float) -> Way:
-        """The paper's selection at a lambda, refined."""
-        if weight == DEFAULT_OPACITY_WEIGHT:
-            return self.pointsplat
-        network = Network(opacity_weight=weight)
-        return Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
 
     def cells(self, shares: Sequence[float]) -> list[tuple[Way, float]]:
         """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones

@@ -1,6 +1,6 @@
 """Journals: every record is written as soon as it is measured, so that an interrupted command can continue.
 
-``points.json`` is the journal of a sweep; the lab keeps the cells of its tables in files of the same form.
+``points.json`` is the journal of a sweep.
 """
 
 from __future__ import annotations
@@ -177,7 +177,5 @@ def _has_type(value: Any, kind: str) -> bool:
         "int": _is_count,
         "float": lambda value: type(value) in (int, float) and not math.isnan(value),
         "ImageMetrics": lambda value: isinstance(value, ImageMetrics),
-        "Point": lambda value: isinstance(value, Point),
-        "tuple[int, ...]": lambda value: isinstance(value, tuple) and all(map(_is_count, value)),
     }
     return checks[kind](value)
