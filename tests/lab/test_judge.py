@@ -7,43 +7,9 @@ import pytest
 import torch
 
 from lab.judge import camera_paths, judge, record, scenes
-from making import box_room
 from peers import peer
-from pointsplat_ns.io import write_ply
 
 PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
-PATH = {
-    "scene": "small",
-    "about": "The walls of a room, from its middle.",
-    "up": [0, 0, 1],
-    "field_of_view": 60,
-    "views": [
-        {"eye": [0.2, 0.1, 0], "at": [2, 0, 0]},
-        {"eye": [0, 0, 0.3], "at": [0, 1.5, 0]},
-        {"eye": [-0.5, 0, 0], "at": [-2, -1, 0.5]},
-    ],
-}
-
-
-@pytest.fixture()
-def folder(tmp_path, monkeypatch) -> Path:
-    """A folder of camera paths in place of those that ship."""
-    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
-    return tmp_path
-
-
-@pytest.fixture()
-def small(folder) -> Path:
-    """A room of 900 Gaussians with a path of three views."""
-    write_ply(box_room(seed=3), folder / "small.ply")
-    write_path(folder)
-    return folder / "small.ply"
-
-
-def write_path(folder: Path, **changes: object) -> Path:
-    path = folder / "small.json"
-    path.write_text(json.dumps({**PATH, **changes}))
-    return path
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lab.judge import bytes as judge_of_bytes
-from lab.judge import camera_paths, record, tables_record
+from lab.judge import record, tables_record
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
 from lab.training import photo_places
@@ -103,16 +103,12 @@ def test_the_record_that_is_committed_is_small_and_its_tables_are_up_to_date():
     assert record.put_between(text, record.readme_table(rows), readme) == text
 
 
-def test_files_of_equal_sizes_are_compared_and_drawn(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
-    write_ply(box_room(seed=3), tmp_path / "small.ply")
-    path = {"scene": "small", "about": "Walls.", "up": [0, 0, 1], "field_of_view": 60}
-    (tmp_path / "small.json").write_text(json.dumps({**path, "views": [{"eye": [0.2, 0.1, 0], "at": [2, 0, 0]}]}))
+def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
     found = tmp_path / "found.json"
 
     def measure(**options: object) -> list[dict]:
         judge_of_bytes.main(
-            (tmp_path / "small.ply",), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
+            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
             width=48, json_path=found, **options,
         )  # fmt: skip
         return json.loads(found.read_text())["rows"]
