@@ -17,8 +17,9 @@ import tyro
 from lab.common.printing import markdown, start
 from lab.judge import refiners
 from lab.judge.record import FOLDER
+from lab.tables.cells import Tables
 from lab.tables.figure import plot_figure
-from lab.tables.layout import Layout, Table, Tables, markdown_table
+from lab.tables.layout import Layout, Table, markdown_table
 from lab.tables.ways import WAYS
 from pointsplat_ns.io.files import replacing
 

@@ -1,26 +1,22 @@
-"""All cells of a folder, arranged as the paper's tables: in Markdown, in LaTeX, and with all figures in JSON."""
+"""All cells of a folder, arranged as the paper's tables, in Markdown and in LaTeX."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from lab.common.printing import markdown, number, percent
-from lab.common.results import Row, write_json
+from lab.common.results import Row
+from lab.tables.cells import FILES, Tables
 from lab.tables.figure import medians, plot_figure
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
-from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import replacing, three_digits
-
-FILES = ("tables.json", "tables.md", "tables.tex", "figure4.png")
-FORMAT = {"format": "pointsplat-tables", "version": 1}
 
 READING = (
     "Figures are means over the same scenes in all rows of a table, but for rows with a mark. PSNR (dB), SSIM and "
@@ -33,7 +29,8 @@ READING = (
 OTHER_SCENES = "†"
 """Mark of a row whose means are over other scenes than those of the table."""
 
-METRICS = {"psnr": number(2), "ssim": number(3), "lpips": number(3)}
+WRITTEN = {"psnr": number(2), "ssim": number(3), "lpips": number(3)}
+"""How metrics are written."""
 
 Cell = tuple[Way, float]
 """A way, and the share of the Gaussians kept."""
@@ -51,145 +48,12 @@ class Table:
     """Lines below the table: what rows were made with, missing cells, and the reasons."""
 
 
-@dataclass
-class Tables:
-    """All cells of a folder."""
-
-    scenes: dict[str, Row] = field(default_factory=dict)
-    """Facts on scenes, by name."""
-    cells: dict[str, Row] = field(default_factory=dict)
-    """Measurements, by key such as fox/merge/10%."""
-    missing: dict[str, str] = field(default_factory=dict)
-    """Reasons for missing cells, by key."""
-
-    @classmethod
-    def of(cls, content: dict[str, Any]) -> Tables:
-        """The tables in a file's content. Errors are those of Python if it is none."""
-        if content["format"] != FORMAT["format"]:
-            raise ValueError(f"of format {content['format']}")
-        scenes = {about["name"]: dict(about) for about in content["scenes"]}
-        cells = {cell["point"]["key"]: cell for cell in content["cells"]}
-        if unknown := {key.split("/")[0] for key in cells} - scenes.keys():
-            raise ValueError(f"cells of unknown scenes {', '.join(sorted(unknown))}")
-        return cls(scenes, cells)
-
-    @classmethod
-    def read(cls, folder: Path, force: bool = False) -> Tables:
-        """The tables of a folder; none if it has none. Raises SceneError if its file cannot be read, or there are files
-        of others; with ``force`` there are none yet."""
-        path = folder / FILES[0]
-        if force:
-            return cls()
-        if not path.exists():
-            if others := [name for name in FILES if (folder / name).exists()]:
-                raise SceneError(
-                    f"{folder / others[0]}: exists already; name another folder, or start over with --force"
-                )
-            return cls()
-        try:
-            return cls.of(json.loads(path.read_text("utf-8")))
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            raise SceneError(
-                f"{path}: not the cells of tables ({error!r:.80}); name another folder, or start over with --force"
-            ) from error
-
-    def enter(self, name: str, about: Row, group: str | None) -> None:
-        """Enter a scene, or find it: a SceneError if existing cells are of another file, other views or another
-        machine. Its group stays, if none is given."""
-        known = self.scenes.get(name, {})
-        for fact, value in about["of"].items() if known else ():
-            if (before := known.get("of", {}).get(fact)) != value:
-                raise SceneError(
-                    f"{name}: its cells are of another {fact.replace('_', ' ')} ({before}, now {value}); name another "
-                    "folder, or start over with --force"
-                )
-        group = group or known.get("group") or about["dataset"] or "scenes"
-        self.scenes[name] = {**known, **about, "group": group}
-
-    def groups(self) -> dict[str, list[str]]:
-        """Names of the scenes with cells by group; the paper's datasets first, the others by name."""
-        measured = {key.split("/")[0] for key in self.cells}
-        found: dict[str, list[str]] = {}
-        for name in sorted(measured, key=lambda name: self.scenes[name]["group"]):
-            found.setdefault(self.scenes[name]["group"], []).append(name)
-
-        def order(group: str) -> int:
-            known = [*PROTOCOL.datasets, self.dataset(found[group])]
-            return known.index(self.dataset(found[group]))
-
-        return {group: sorted(found[group]) for group in sorted(found, key=order)}
-
-    def dataset(self, names: Sequence[str]) -> str:
-        """The dataset of the paper that has all these scenes; empty if there is none."""
-        datasets = {self.scenes[name]["dataset"] for name in names}
-        return datasets.pop() if len(datasets) == 1 and datasets <= {*PROTOCOL.datasets} else ""
-
-    def comparable(self, names: Sequence[str]) -> str:
-        """The dataset whose published figures compare with these scenes': all are of it, and were measured by the
-        paper's protocol; empty if there is none."""
-        known = [self.scenes[name].get("differs", "measured by an older version") for name in names]
-        return "" if any(known) else self.dataset(names)
-
-    def save(self, folder: Path) -> None:
-        """Write all figures as JSON."""
-        groups, paper = self.groups(), {}
-        for group, names in groups.items():
-            if dataset := self.comparable(names):
-                cells = {(c["way"], c["point"]["share"]) for k, c in self.cells.items() if k.split("/")[0] in names}
-                paper[group] = {
-                    f"table {number}, {way}, {100 * share:g}%": dict(zip(METRICS, figures, strict=True))
-                    for number in (1, 3, 4)
-                    for way, share in sorted(cells)
-                    if (figures := published(number, dataset, way, share))
-                }
-        scenes = [self.scenes[name] for names in groups.values() for name in names]
-        content = {"groups": groups, "scenes": scenes, "cells": list(self.cells.values())}
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / FILES[0], FORMAT | content | {"paper": paper, "not_measured": self.missing})
-
-    def write(self, folder: Path, keeps: Sequence[float]) -> None:
-        """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows without
-        measurements."""
-        if not self.cells:
-            return
-        self.save(folder)
-        groups = self.groups()
-        tables = {group: Layout(self, group, names, keeps).tables() for group, names in groups.items()}
-        with replacing(folder / FILES[1], named=False) as part:
-            part.write_text(self._markdown(tables), encoding="utf-8")
-        with replacing(folder / FILES[2], named=False) as part:
-            every = [latex_table(table) for members in tables.values() for table in members]
-            part.write_text("\n".join([r"% needs \usepackage{booktabs}", *every]), encoding="utf-8")
-        plot_figure(self.cells, groups, folder / FILES[3])
-
-    def _markdown(self, tables: dict[str, list[Table]]) -> str:
-        machines = sorted({self.scenes[key.split("/")[0]]["machine"] for key in self.cells})
-        made = sorted({f"{cell['version']}, commit {cell['commit'] or 'unknown'}" for cell in self.cells.values()})
-        parts = [READING, escaped(f"Measured on {'; '.join(machines)}, by pointsplat_ns {'; '.join(made)}.")]
-        for group, names in self.groups().items():
-            heads, lines = ["scene", "Gaussians", "judged in", "size", "differs from the paper in"], []
-            for about in map(self.scenes.__getitem__, names):
-                dense = self.cells.get(cell_key(about["name"], WAYS.dense, 1.0))
-                count = f"{dense['point']['gaussians']:,}" if dense else "-"
-                size = f"{about['width']} x {about['height']}"
-                line = (about["name"], count, f"{about['views']} {about['origin']}", size, about.get("differs", ""))
-                lines.append(list(map(escaped, line)))
-            if self.dataset(names) and self.comparable(names):
-                parts_of_paper = (
-                    "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS is by VGG."
-                )
-                parts.append(parts_of_paper)
-            parts += [f"## {escaped(group)}", markdown(heads, lines), *map(markdown_table, tables[group])]
-        parts += [f"![Figure 4]({FILES[3]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
-        return "\n\n".join(part.strip() for part in parts) + "\n"
-
-
 class Layout:
     """Makes the tables of a group of scenes. ``keeps`` are the shares of Tables 1 and 2, to which those of measured
     cells are added."""
 
     def __init__(self, tables: Tables, group: str, names: Sequence[str], keeps: Sequence[float]):
-        self.tables_, self.group, self.names = tables, group, names
+        self.all, self.group, self.names = tables, group, names
         self.cells = {key: cell for key, cell in tables.cells.items() if key.split("/")[0] in names}
         of_table_1 = {way.name for way in WAYS.table_1} - {way.name for way in WAYS.table_4}  # Table 4 has other shares
         measured = {cell["point"]["share"] for cell in self.cells.values() if cell["way"] in of_table_1}
@@ -225,19 +89,19 @@ class Layout:
 
     def _quality(self, which: int, title: str, first: tuple[str, ...], rows: list[tuple]) -> Table:
         """A table of PSNR, SSIM, LPIPS, with the paper's PSNR and SSIM where dataset and protocol are the paper's."""
-        dataset, cells = self.tables_.comparable(self.names), [(way, share) for _, way, share in rows]
+        dataset, cells = self.all.comparable(self.names), [(way, share) for _, way, share in rows]
         theirs = {cell: published(which, dataset, cell[0].name, cell[1]) for cell in cells}
         kinds = (["photos"] if self.has_photos else []) + ["renders"]
-        heads = [name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in METRICS]
+        heads = [name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN]
         heads += ["loses most", "scenes"] + ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
 
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
-            found = [_text(write, mean[f"{kind}_{name}"]) for kind in kinds for name, write in METRICS.items()]
+            found = [_text(write, mean[f"{kind}_{name}"]) for kind in kinds for name, write in WRITTEN.items()]
             return [*found, _worst(same)]
 
         def more(cell: Cell) -> list[str]:
             known = (theirs[cell] or (None, None))[:2]
-            return [_text(write, value) for write, value in zip(METRICS.values(), known, strict=False)]
+            return [_text(write, value) for write, value in zip(WRITTEN.values(), known, strict=False)]
 
         return self._table(which, title, first, heads, rows, figures, more if any(theirs.values()) else None)
 
@@ -295,7 +159,7 @@ class Layout:
             for name in self.names:
                 key, label = cell_key(name, way, share), f"{way.label} ({percent(share)})"
                 if key not in self.cells:
-                    why = f"Not measured, {self.tables_.missing.get(key, 'not yet')}"
+                    why = f"Not measured, {self.all.missing.get(key, 'not yet')}"
                     found.setdefault(why, {})[label if len(self.names) == 1 else f"{label} on {name}"] = None
                 elif (with_what := self.cells[key]["made_with"]) and (way.network is not None or way.fine_tuned):
                     found.setdefault(f"Made with {with_what}", {})[label] = None
@@ -323,7 +187,7 @@ def _flat(key: str, cell: Row) -> Row:
     row = {"scene": key.split("/")[0], "way": cell["way"], **{n: point[n] for n in ("share", "gaussians", "bytes")}}
     for kind, target in (("renders", "against_dense"), ("photos", "against_photos")):
         found = point[target] or {}
-        row |= {f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v for name in METRICS}
+        row |= {f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v for name in WRITTEN}
     return row | {"frame_ms": point["frame_ms"]}
 
 
@@ -364,3 +228,39 @@ def latex_table(table: Table) -> str:
     frame = pd.DataFrame([[" ".join(text.split()) for text in row] for row in table.rows], columns=list(table.header))
     about = [f"% {' '.join(text.split())}" for text in (f"Table {table.number}. {table.title}", *table.notes)]
     return "\n".join([*about, frame.to_latex(index=False, escape=True)])
+
+
+def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
+    """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows without
+    measurements."""
+    if not tables.cells:
+        return
+    tables.save(folder)
+    groups = tables.groups()
+    made = {group: Layout(tables, group, names, keeps).tables() for group, names in groups.items()}
+    with replacing(folder / FILES[1], named=False) as part:
+        part.write_text(_markdown(tables, made), encoding="utf-8")
+    with replacing(folder / FILES[2], named=False) as part:
+        every = [latex_table(table) for members in made.values() for table in members]
+        part.write_text("\n".join([r"% needs \usepackage{booktabs}", *every]), encoding="utf-8")
+    plot_figure(tables.cells, groups, folder / FILES[3])
+
+
+def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
+    machines = sorted({tables.scenes[key.split("/")[0]]["machine"] for key in tables.cells})
+    made = sorted({f"{cell['version']}, commit {cell['commit'] or 'unknown'}" for cell in tables.cells.values()})
+    parts = [READING, escaped(f"Measured on {'; '.join(machines)}, by pointsplat_ns {'; '.join(made)}.")]
+    for group, names in tables.groups().items():
+        heads, lines = ["scene", "Gaussians", "judged in", "size", "differs from the paper in"], []
+        for about in map(tables.scenes.__getitem__, names):
+            dense = tables.cells.get(cell_key(about["name"], WAYS.dense, 1.0))
+            count = f"{dense['point']['gaussians']:,}" if dense else "-"
+            size = f"{about['width']} x {about['height']}"
+            line = (about["name"], count, f"{about['views']} {about['origin']}", size, about.get("differs", ""))
+            lines.append(list(map(escaped, line)))
+        if tables.dataset(names) and tables.comparable(names):
+            parts_of_paper = "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS is by VGG."
+            parts.append(parts_of_paper)
+        parts += [f"## {escaped(group)}", markdown(heads, lines), *map(markdown_table, made_tables[group])]
+    parts += [f"![Figure 4]({FILES[3]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
+    return "\n\n".join(part.strip() for part in parts) + "\n"

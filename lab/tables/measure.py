@@ -20,8 +20,9 @@ import tyro
 import pointsplat_ns
 from lab.common.compare import lpips_or_none, metrics_of
 from lab.common.results import Row
+from lab.tables.cells import Tables
 from lab.tables.figure import distributions
-from lab.tables.layout import Tables
+from lab.tables.layout import write_tables
 from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
@@ -150,7 +151,7 @@ def measure_tables(
             for name, cells in tracked(wanted.items(), "measuring", len(wanted)):
                 _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
         finally:
-            tables.write(output, keeps)
+            write_tables(tables, output, keeps)
     print(f"{output}: tables.md, tables.tex, tables.json and figure4.png")
     return tables
 

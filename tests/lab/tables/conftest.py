@@ -10,7 +10,7 @@ import torch
 import peers
 import pointsplat_ns as ps
 from lab.tables import layout
-from lab.tables.layout import Tables
+from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from lab.tables.ways import Ways
 from making import box_room

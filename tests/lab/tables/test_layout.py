@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from lab.tables import figure, layout
+from lab.tables.cells import FILES, Tables
 from lab.tables.figure import OPACITY_EDGES, VOLUME_EDGES, distributions, medians
-from lab.tables.layout import Layout, Table, Tables, latex_table, markdown_table
+from lab.tables.layout import Layout, Table, latex_table, markdown_table, write_tables
 from lab.tables.ways import WAYS, cell_key
 from making import ball
 
@@ -123,8 +124,8 @@ def written(monkeypatch, tmp_path):
     monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
 
     def write(tables):
-        tables.write(tmp_path, (0.3, 0.1))
-        return {name: (tmp_path / name).read_text() for name in layout.FILES}
+        write_tables(tables, tmp_path, (0.3, 0.1))
+        return {name: (tmp_path / name).read_text() for name in FILES}
 
     return write
 

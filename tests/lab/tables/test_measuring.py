@@ -9,7 +9,7 @@ import pytest
 
 import pointsplat_ns as ps
 from lab.common.printing import start
-from lab.tables.layout import Tables
+from lab.tables.cells import Tables
 from lab.tables.measure import Judge, measure_tables
 from lab.tables.ways import WAYS
 from making import box_room
