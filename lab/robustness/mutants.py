@@ -3,9 +3,10 @@
     pip install cosmic-ray
     OMP_NUM_THREADS=1 python -m lab.robustness.mutants --seed 0 --output outputs/mutants
 
-The same seed draws the same faults. They are tried in a git worktree of HEAD below the output (``git worktree
-remove outputs/mutants/tree`` ends it), so your files stay as they are. The same command resumes after an interruption. A fault in an annotation, a decorator or a constant of a
-module is not drawn: nothing depends on the first, and any other value of the last is another tuning.
+The same seed draws the same faults. They are tried in a git worktree of HEAD below the output, so your files stay as
+they are; ``git worktree remove outputs/mutants/tree`` removes it. The same command resumes after an interruption. A
+fault in an annotation, a decorator or a constant of a module is not drawn: nothing depends on the first two, and any
+other value of the last is another tuning.
 """
 
 from __future__ import annotations
