@@ -64,6 +64,15 @@ def number(digits: int, scale: float = 1.0, sign: str = "") -> Callable[[float |
     return lambda value: "-" if value is None else f"{scale * value:{sign},.{digits}f}"
 
 
+def percent(share: float) -> str:
+    """A share for people.
+
+    >>> percent(0.1)
+    '10 %'
+    """
+    return f"{100 * share:g} %"
+
+
 megabytes = number(0, 1e-6)
 """Bytes as megabytes."""
 

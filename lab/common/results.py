@@ -34,21 +34,13 @@ class Results:
         path: the JSON file; None for none.
         settings: what rows depend on beside what they name themselves.
         resume: take up the rows that the file has.
-        summarise: what else the file tells of all rows, by name.
 
     Raises:
         SystemExit: if the file to take up cannot be read or was written with other settings.
     """
 
-    def __init__(
-        self,
-        path: Path | None,
-        settings: dict[str, Any],
-        resume: bool,
-        summarise: Callable[[list[Row]], dict[str, Any]] = lambda rows: {},
-    ):
+    def __init__(self, path: Path | None, settings: dict[str, Any], resume: bool):
         self.path, self.settings = path, json.loads(json.dumps(settings))
-        self.summarise = summarise
         self.rows: list[Row] = []
         if resume and path is None:
             raise SystemExit("--resume without --json; expected the file to take up")
@@ -70,4 +62,4 @@ class Results:
     def put(self, name: str, rows: list[Row]) -> None:
         """Put rows of a scene in the place of those there are, and write."""
         self.rows = [row for row in self.rows if row["scene"] != name] + rows
-        write_json(self.path, {"settings": self.settings, "rows": self.rows} | self.summarise(self.rows))
+        write_json(self.path, {"settings": self.settings, "rows": self.rows})

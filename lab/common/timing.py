@@ -1,13 +1,12 @@
-"""Clocks, memory, and slopes over sizes."""
+"""Clocks and memory."""
 
 from __future__ import annotations
 
-import ctypes
-import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -35,8 +34,8 @@ def seconds_of(call: Callable[[], object]) -> float:
 
 
 def timed(
-    functions: dict[str, Callable[[], dict[str, float]]], repeats: int, budget: float, fastest: bool = False
-) -> dict[str, float]:
+    functions: dict[Any, Callable[[], dict[Any, float]]], repeats: int, budget: float, fastest: bool = False
+) -> dict[Any, float]:
     """Call every function once a round and take medians, so that a busy moment of the machine hits all alike.
 
     Args:
@@ -47,9 +46,9 @@ def timed(
         fastest: take the fastest round of each figure in place of the median.
     """
     begin = time.perf_counter()
-    rounds: list[dict[str, float]] = []
+    rounds: list[dict[Any, float]] = []
     for i in range(repeats + 1):
-        seconds: dict[str, float] = {}
+        seconds: dict[Any, float] = {}
         for function in functions.values():
             seconds |= function()
         spent = time.perf_counter() - begin
@@ -59,28 +58,6 @@ def timed(
             break
     choose = min if fastest else statistics.median
     return {name: choose([r[name] for r in rounds]) for name in rounds[0]}
-
-
-def peak_extra_bytes(function: Callable[[], object], device: torch.device) -> int | None:
-    """Memory that ``function`` takes at its highest above what was held before; None where it cannot be known.
-
-    On a CPU: the resident high-water mark of the process (Linux), after giving freed memory back.
-    """
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-        before = torch.cuda.memory_allocated()
-        torch.cuda.reset_peak_memory_stats()
-        function()
-        torch.cuda.synchronize()
-        return torch.cuda.max_memory_allocated() - before
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-        start_of_peak()
-        before = status_bytes("VmHWM")
-        function()
-        return max(0, status_bytes("VmHWM") - before)
-    except (OSError, AttributeError):
-        return None
 
 
 def start_of_peak() -> None:
@@ -102,18 +79,3 @@ def status_bytes(field: str) -> int:
         if line.startswith(field + ":"):
             return 1024 * int(line.split()[1])
     raise OSError(f"/proc/self/status has no {field}")
-
-
-def slope(xs: Sequence[float], ys: Sequence[float | None]) -> float | None:
-    """Least-squares slope of log y over log x: 1 where y is linear in x.
-
-    Pairs that are not positive are left out; None where what remains does not even double x.
-
-    >>> round(slope([100, 200, 400], [1.0, 2.0, 4.0]), 6)
-    1.0
-    """
-    points = [(math.log(x), math.log(y)) for x, y in zip(xs, ys, strict=True) if y is not None and min(x, y) > 0]
-    u, v = [x for x, _ in points], [y for _, y in points]
-    if not points or max(u) - min(u) < math.log(2):
-        return None
-    return statistics.linear_regression(u, v).slope

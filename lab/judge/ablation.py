@@ -5,73 +5,135 @@
     python -m lab.judge.ablation --write ablation.json               # docs/record/ablation.md, from one file or several
 
 A PLY is looked at along the camera path of its name in ``lab/judge/paths``, a Splatfacto run from the poses of its
-held-out photos. A run is merged twice: without poses, and with those of its training photos. ``lab/judge/variants.py``
-has the variants. Choose constants on scenes for tuning (``python -m lab.judge.judge --list``).
+held-out photos. A run is merged twice: without poses, and with those of its training photos. Choose constants on scenes
+for tuning (``python -m lab.judge.judge --list``). A new variant is one line in :data:`VARIANTS`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import time
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from statistics import fmean
-from typing import Annotated
+from typing import Annotated, Any
 
+import pandas as pd
 import torch
 import tyro
 
-from lab.common.printing import console, start, table
+from lab.common.printing import markdown, percent, start
 from lab.common.results import Results, Row
-from lab.common.scenes import room
+from lab.common.scenes import group_of, room
 from lab.common.ways import count_of
-from lab.judge import ablation_record as record
-from lab.judge.judge import LEAST_WIDTH, known_rows
-from lab.judge.scenes import PHOTOS, JudgedScene, check, covered_psnr, load
-from lab.judge.variants import BASELINE, applied, changes_of, names
-from lab.judge.variants import check as check_variants
-from pointsplat_ns.gaussians import Gaussians
+from lab.judge.record import FOLDER, read, write_rows
+from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.merging import merge
-from pointsplat_ns.rasterizer import render, render_with_alpha
-from pointsplat_ns.system.progress import progress_bar
-from pointsplat_ns.views import Views
+from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.system.progress import tracked
+
+BASELINE = "default"
+"""Name of the settings that all variants are compared with."""
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "no_renders": dict(min_count_rendered=10**9),
+    "reference_20k": dict(max_count_rendered=20_000),
+    "sampled_views_24": dict(sampled_views=24),
+    "other_views": dict(view_seed=2),
+    "visibility_views_16": dict(visibility_views=16),
+    "visibility_side_56": dict(visibility_side=56),
+    "visibility_side_224": dict(visibility_side=224),
+    "drawn_100k": dict(max_count_drawn=100_000),
+    "well_seen_0.98": dict(well_seen_quantile=0.98),
+    "equal_weights": dict(min_visibility=1.0),
+    "min_visibility_1e-2": dict(min_visibility=1e-2),
+    "neighbours_4": dict(neighbours=4),
+    "neighbours_8": dict(neighbours=8),
+    "round_share_0.3": dict(round_share=0.3),
+    "round_share_0.5": dict(round_share=0.5),
+    "matching_passes_3": dict(matching_passes=3),
+    "colour_axes_3": dict(colour_axes=3),
+    "no_max_colour": dict(max_colour=1e6),
+    "min_contrast_0.001": dict(min_contrast=0.001),
+    "min_contrast_0.05": dict(min_contrast=0.05),
+    "no_background": dict(background_contrast=0.0),
+    "background_decay_1": dict(background_decay=1.0),
+    "min_cover_0.1": dict(min_cover=0.1),
+    "max_opacity_0.99": dict(max_opacity=0.99),
+    "growth_0": dict(growth_exponent=0.0),
+    "growth_1": dict(growth_exponent=1.0),
+    "no_max_growth": dict(max_growth_ratio=1e9),
+    "no_regrouping": dict(regrouping_rounds=0),
+    "regrouping_once": dict(regrouping_rounds=1),
+    "regrouping_candidates_3": dict(regrouping_candidates=3),
+    "no_regrouping_contrast": dict(regrouping_contrast=1e6),
+    "no_finish": dict(finish_views=0),
+    "finish_views_8": dict(finish_views=8),
+    "no_depth": dict(depth_exponent=0.0),
+    "wide_size_changes": dict(size_changes=(-0.2, 0.0, 0.1)),
+    "no_size_change_margin": dict(size_change_margin=0.0),
+}
+"""For each rule the value that turns it off, or a value beside the default: fields of
+:class:`~pointsplat_ns.pruning.merging.MergeSettings`."""
+
+POSES = "photos, poses given"
+"""In place of a width: the poses of held-out photos, where merging is given those of the training photos."""
+
+LITTLE = 0.1
+"""Change in dB below which a variant has no row."""
+
+PAGE = """# What each setting of merging is worth
+
+`lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
+rule off, or moves a setting to a value beside its default.
+
+- A change is PSNR of the variant minus PSNR of the defaults, dB: mean (smallest…largest) over scenes. Below 0, the
+  default is better.
+- Splats are judged in at most {views} views of a camera path that was written by hand, {width} pixels wide.
+- Captures are judged in the poses of at most {views} held-out photos, at the size of the photos: once merged without
+  poses, once with the poses of the training photos.
+- PSNR is that of [the judge](judge.md).
+- CPU is CPU seconds of merging, relative to the defaults.
+- Variants come in the order of their mean changes. `other_views` shows how much is chance.
+- Fields of `pruning/merging/settings.py` say what they do.
+
+## Scenes
+
+PSNR of the defaults, dB:
+
+{scenes}
+
+## Variants
+
+{variants}
+
+Within {little:g} dB in each: {still}.{moved}
+"""
 
 Task = tuple[int | str, float, str]
 """``at`` of a row (where the result is looked at, and whether poses are given), the share to keep, the variant."""
 
 
-class Judge:
-    """Compares smaller scenes with renders of the dense one, which are made once.
-
-    Args:
-        scene: with one look.
-
-    Raises:
-        SystemExit: if no view shows the scene.
-    """
-
-    def __init__(self, scene: JudgedScene):
-        self.views = []
-        for view in scene.looks[0].views:
-            image, alpha = render_with_alpha(scene.dense, view)
-            if covered := float(alpha.double().mean()):
-                self.views.append((view, image, covered))
-        if not self.views:
-            raise SystemExit(f"{scene.name}: no view shows the scene; expected at least one")
-
-    def psnr(self, small: Gaussians) -> float:
-        """Mean over views of :func:`~lab.judge.scenes.covered_psnr`, dB."""
-        return fmean(covered_psnr(render(small, view), image, covered) for view, image, covered in self.views)
+def changes_of(name: str) -> dict[str, Any]:
+    """The changes of a variant as JSON has them: none for :data:`BASELINE`."""
+    return json.loads(json.dumps(VARIANTS.get(name, {})))
 
 
-def tasks_of(scene: JudgedScene, known: list[Row], keeps: tuple[float, ...], variants: list[str]) -> list[Task]:
-    """The tasks that have no row yet, or one of other changes."""
-    [look] = scene.looks
-    ats = (PHOTOS, record.POSES) if look.at == PHOTOS else (look.at,)
-    there = {(row["at"], row["keep"], row["method"]) for row in record.current(known)}
-    tasks = [(at, keep, name) for at in ats for keep in keeps for name in (BASELINE, *variants)]
-    return [task for task in tasks if task not in there]
+def settings_of(views: int, width: int) -> dict[str, Any]:
+    """What rows depend on beside what they name themselves."""
+    return {"views": views, "width": width} | {f"merging.{name}": value for name, value in vars(MERGING).items()}
+
+
+def current(rows: list[Row]) -> list[Row]:
+    """The rows of the defaults, and of variants that there are still, with the same changes."""
+    known = {BASELINE, *VARIANTS}
+    return [row for row in rows if row["method"] in known and row["changes"] == changes_of(row["method"])]
+
+
+def key(row: Row) -> Task:
+    """The task that a row is of."""
+    return row["at"], row["keep"], row["method"]
 
 
 @cache
@@ -80,107 +142,149 @@ def warm_up() -> None:
     merge(room(3_000), 300)
 
 
-def row_of(scene: JudgedScene, task: Task, judge: Judge, poses: Views | None, report: Callable[[float], None]) -> Row:
-    """The row of one task.
-
-    Args:
-        scene: with one look.
-        task: what to do.
-        judge: of this scene.
-        poses: views that merging is given, or None.
-        report: called with the share done of merging.
-    """
-    at, keep, name = task
-    begin = time.process_time()
-    with applied(name) as settings:
-        small = merge(scene.dense, count_of(keep, len(scene.dense)), report, poses, settings=settings).scene
-    seconds = time.process_time() - begin
-    row: Row = {"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense), "at": at, "keep": keep}
-    return row | {
-        "method": name,
-        "changes": changes_of(name),
-        "covered_psnr": judge.psnr(small),
-        "cpu_seconds": seconds,
-    }
-
-
-def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results, stay: list[Row]) -> None:
-    """Measure tasks and write the rows of the scene after each.
+def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results, rows: dict[Task, Row]) -> None:
+    """Measure tasks, and write the rows of the scene after each.
 
     Args:
         scene: with one look.
         path: where it was read from.
         tasks: what to measure.
         results: where rows go.
-        stay: rows of the scene that are there and stay.
+        rows: those of the scene that are there and stay.
     """
-    rows = {record.key(row): row for row in stay}
-    poses = dataset_views(path, "train") if any(at == record.POSES for at, _, _ in tasks) else None
+    poses = dataset_views(path, "train") if any(at == POSES for at, _, _ in tasks) else None
     warm_up()
-    with progress_bar() as show:
-        judge = Judge(scene)
-        for done, task in enumerate(tasks):
-            at = task[0]
+    dense = DenseViews(scene.dense, scene.looks[0].views)
+    for at, keep, name in tracked(tasks, f"{scene.name}: merged and compared", len(tasks)):
+        settings = dataclasses.replace(MERGING, **VARIANTS.get(name, {}))
+        views, begin = poses if at == POSES else None, time.process_time()
+        small = merge(scene.dense, count_of(keep, len(scene.dense)), views=views, settings=settings).scene
+        seconds = time.process_time() - begin
+        row: Row = {"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense), "at": at, "keep": keep}
+        row |= {"method": name, "changes": changes_of(name)}
+        rows[at, keep, name] = row | {"covered_psnr": dense.psnr(small), "cpu_seconds": seconds}
+        results.put(scene.name, list(rows.values()))
 
-            def report(share: float, done: int = done) -> None:
-                show(f"{scene.name}: merged and compared", (done + 0.9 * share) / len(tasks))
 
-            row = row_of(scene, task, judge, poses if at == record.POSES else None, report)
-            rows[record.key(row)] = row
-            results.put(scene.name, list(rows.values()))
+def table_of(rows: list[Row]) -> pd.DataFrame:
+    """Changes in dB and CPU seconds of each variant and budget, by scene and poses, the largest loss first."""
+    table = pd.DataFrame(current(rows))
+    place = ["scene", "at", "keep"]
+    defaults = table[table["method"] == BASELINE].set_index(place)[["covered_psnr", "cpu_seconds"]]
+    found = table[table["method"] != BASELINE].join(defaults, on=place, rsuffix="_default", how="inner")
+    found["change"] = found["covered_psnr"] - found["covered_psnr_default"]
+    found["mean"] = found.groupby("method")["change"].transform("mean")
+    return found.sort_values(["mean", "method"], kind="stable")
+
+
+def variant_table(found: pd.DataFrame, settings: dict[str, Any]) -> tuple[str, list[str]]:
+    """A row for each variant that changes anything, and the names of the others."""
+    keeps, lines, still = sorted(found["keep"].unique()), [], []
+    for name, same in found.groupby("method", sort=False):
+        if (same["change"].abs() < LITTLE).all():
+            still.append(str(name))
+            continue
+        changes = changes_of(str(name))
+        moves = (f"`{f}` {_value(settings.get(f'merging.{f}'))} to {_value(changes[f])}" for f in changes)
+        cells = []
+        for keep in keeps:
+            some = same.loc[same["keep"] == keep, "change"]
+            cells.append(f"{some.mean():+.2f} ({some.min():+.2f}…{some.max():+.2f})" if len(some) else "-")
+        ratio = same["cpu_seconds"].sum() / same["cpu_seconds_default"].sum()
+        lines.append(
+            [f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}", len(same[["scene", "at"]].drop_duplicates())]
+        )
+    return markdown(["variant", "change", *map(percent, keeps), "CPU", "scenes and poses"], lines), still
+
+
+def page(rows: list[Row], settings: dict[str, Any]) -> str:
+    """The page of all tables."""
+    base = pd.DataFrame([row for row in current(rows) if row["method"] == BASELINE])
+    where = {PHOTOS: "held-out photos", POSES: "held-out photos, poses given"}
+    keeps, lines = sorted(base["keep"].unique()), []
+    for (scene, count, at), same in base.groupby(["scene", "gaussians", base["at"].astype(str)]):
+        psnr = same.set_index("keep")["covered_psnr"]
+        cells = [f"{psnr[keep]:.2f}" if keep in psnr else "-" for keep in keeps]
+        lines.append([scene, f"{count:,}", where.get(at, "camera path"), group_of(scene) or "other", *cells])
+    variants, still = variant_table(table_of(rows), settings)
+    now = json.loads(json.dumps(settings_of(0, 0)))
+    moved = [n for n, value in now.items() if n.startswith("merging.") and settings.get(n, value) != value]
+    return PAGE.format(
+        **{name: settings[name] for name in ("views", "width")}, little=LITTLE, variants=variants,
+        scenes=markdown(["scene", "Gaussians", "views", "list", *map(percent, keeps)], lines),
+        still=", ".join(f"`{name}`" for name in still) or "none",
+        moved=f"\n\nDefaults that have changed since: {', '.join(f'`{name}`' for name in moved)}." if moved else "",
+    )  # fmt: skip
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return f"({', '.join(map(_value, value))})"
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+
+
+def write(files: tuple[Path, ...], folder: Path) -> None:
+    """Write ablation.json and ablation.md from files of this program.
+
+    Raises:
+        SystemExit: if a file cannot be read, two files have different settings or one row twice, or there is nothing to
+            compare.
+    """
+    rows, settings = read(files, "ablation.py")
+    rows = current(rows)
+    if table_of(rows).empty:
+        raise SystemExit(f"{', '.join(map(str, files))}: no variant and the defaults of one scene; expected some")
+    write_rows(rows, settings, folder / "ablation.json")
+    with replacing(folder / "ablation.md") as part:
+        part.write_text(page(rows, settings), "utf-8")
+    print(folder / "ablation.md")
 
 
 @torch.no_grad()
 def main(
     scenes: tyro.conf.Positional[tuple[Path, ...]] = (),
     keep: tuple[float, ...] = (0.1, 0.5),
-    variants: tuple[str, ...] = (),
+    variants: tuple[str, ...] = tuple(VARIANTS),
     views: int = 8,
     width: int = 960,
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     resume: bool = False,
-    write: tuple[Path, ...] = (),
-    record_folder: Annotated[Path, tyro.conf.arg(name="record")] = record.FOLDER,
+    write_from: Annotated[tuple[Path, ...], tyro.conf.arg(name="write")] = (),
+    record: Path = FOLDER,
 ) -> None:
     """Print what each setting of merging is worth: the change in dB where a variant takes the place of the defaults.
 
     Args:
         scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
         keep: shares of the Gaussians to keep.
-        variants: names of variants to measure; none means all.
+        variants: names of variants to measure.
         views: at most so many views of each scene, evenly spread.
         width: of the pictures of camera paths, pixels; the height is 9/16 of it.
         json_path: write all rows there, after each.
         resume: take up the rows of that file. What it lacks is measured.
-        write: only write the record, from these files of one or several runs.
-        record_folder: folder of the record.
+        write_from: only write the record, from these files of one or several runs.
+        record: folder of the record.
     """
-    if write:
-        if scenes:
-            raise SystemExit("scenes and --write; expected one of both")
-        for target in record.write(write, record_folder):
-            print(target)
+    if write_from:
+        write(write_from, record)
         return
-    if not scenes:
-        raise SystemExit("no scene named; expected PLY files or runs, or --write")
-    if not all(0 < share <= 1 for share in keep):
-        raise SystemExit(f"--keep {' '.join(map(str, keep))}; expected shares above 0, at most 1")
-    if views < 1 or width < LEAST_WIDTH:
-        raise SystemExit(f"{views} views of width {width}; expected at least 1, and {LEAST_WIDTH} pixels")
-    check_variants(variants)
-    chosen = list(variants) or names()
-    results = Results(json_path, record.settings_of(views, width), resume)
+    check_options(scenes, keep, views, (width,))
+    if unknown := {*variants} - {*VARIANTS}:
+        raise SystemExit(f"--variants {', '.join(sorted(unknown))}; expected some of: {', '.join(VARIANTS)}")
+    settings = settings_of(views, width)
+    results = Results(json_path, settings, resume)
     shown: list[Row] = []
     for name, path in zip(check(scenes), scenes, strict=True):
         scene = load(path, (width,), views)
-        known = known_rows(results, scene)
-        if tasks := tasks_of(scene, known, keep, chosen):
-            measure(scene, path, tasks, results, known)
+        rows = {key(row): row for row in known_rows(results, scene)}
+        there = {key(row) for row in current(list(rows.values()))}
+        ats = (PHOTOS, POSES) if scene.looks[0].at == PHOTOS else (scene.looks[0].at,)
+        wanted = [(at, share, variant) for at in ats for share in keep for variant in (BASELINE, *variants)]
+        if tasks := [task for task in wanted if task not in there]:
+            measure(scene, path, tasks, results, rows)
         shown += [row for row in results.of(name) if row["keep"] in keep]
-    heads = ("variant", *(f"{100 * share:g} %, dB" for share in keep), "CPU")
-    found = record.summaries(shown)
-    lines = [(each.name, *map(each.cell, keep), f"{each.cpu_ratio:.2f}") for each in found]
-    console().print(table("change by each variant, mean (smallest to largest)", heads, lines))
+    text, still = variant_table(table_of(shown), json.loads(json.dumps(settings)))
+    print(f"{text}\n\nWithin {LITTLE:g} dB in each: {', '.join(still) or 'none'}.")
 
 
 if __name__ == "__main__":

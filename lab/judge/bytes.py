@@ -13,18 +13,17 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean
 from typing import Annotated, cast
 
+import pandas as pd
 import torch
 import tyro
 
 from lab.common.printing import console, save_figure, table
 from lab.common.results import Results, Row, grouped
-from lab.common.ways import PEER, Way, pointsplat_command
+from lab.common.ways import PEER, SplatTransform, Way, pointsplat_command
 from lab.judge.record import OURS
 from lab.judge.scenes import JudgedScene, check, load, losses
-from lab.tables.making import SplatTransform
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.system.programs import run_measured
@@ -75,28 +74,26 @@ def peer_file(peer: SplatTransform, source: Path, gaussians: int, limit: int, ta
     return seconds
 
 
-def leads(rows: list[Row]) -> list[tuple[str, float, str, float]]:
-    """Scene, megabytes, measure and dB: how far each of our ways is above the best file of splat-transform."""
-    found = []
-    for (scene, size, _), group in grouped(rows, lambda row: (row["scene"], row["megabytes"], row["at"])).items():
-        best: dict[str, float] = {}
-        for row in group:
-            name = row["way"].rpartition(" ")[0]
-            best[name] = max(best.get(name, -1e9), row["covered_psnr"])
-        for name in OURS:
-            if name in best and PEER in best:
-                found.append((scene, size, f"{name} above {PEER}", best[name] - best[PEER]))
-    return found
+def leads(rows: list[Row]) -> pd.DataFrame:
+    """dB that each of our ways is above the best file of splat-transform: rows by size and scene, a column a way."""
+    table = pd.DataFrame(rows)
+    table["name"] = table["way"].str.rsplit(" ", n=1).str[0]
+    best = table.pivot_table(index=["megabytes", "scene"], columns="name", values="covered_psnr", aggfunc="max")
+    return best.reindex(columns=OURS).sub(best.get(PEER), axis=0).dropna(axis="columns", how="all")
 
 
 def lead_table(rows: list[Row]) -> None:
-    """Print the mean and the worst lead for each size."""
-    lines = []
-    for (size, what), group in sorted(grouped(leads(rows), lambda lead: (lead[1], lead[2])).items()):
-        worst = min(group, key=lambda lead: lead[3])
-        mean = fmean(lead[3] for lead in group)
-        lines.append((f"{size:g} MB", what, len(group), f"{mean:+.1f}", f"{worst[3]:+.1f} {worst[0]}"))
-    console().print(table("dB at equal bytes", ("size", "way", "scenes", "mean", "worst"), lines, ("way", "worst")))
+    """Print the mean and the worst lead for each size, where there are files of splat-transform."""
+    if not any(row["way"].startswith(PEER) for row in rows):
+        return
+    lines = [
+        (f"{size:g} MB", way, len(known), f"{known.mean():+.1f}", f"{known.min():+.1f} {known.idxmin()[1]}")
+        for size, same in leads(rows).groupby("megabytes")
+        for way in same
+        if len(known := same[way].dropna())
+    ]
+    heads = ("size", f"above {PEER}", "scenes", "mean", "worst")
+    console().print(table("dB at equal bytes", heads, lines, (heads[1], "worst")))
 
 
 def draw(rows: list[Row], path: Path) -> None:

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from PIL import Image, ImageDraw
@@ -61,37 +60,36 @@ def read_path(path: Path) -> CameraPath:
     Raises:
         SystemExit: if the file cannot be read, or is not a path.
     """
-    if not path.is_file():
-        raise SystemExit(f"{path}: no such file; expected a camera path for {path.stem}")
     try:
         content = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise SystemExit(f"{path}: cannot be read as JSON ({error}); expected a camera path") from error
-    if not isinstance(content, dict):
-        raise SystemExit(f"{path}: found {type(content).__name__}; expected an object with scene, up, views")
-    for name in ("scene", "about"):
-        if not isinstance(content.get(name), str) or not content[name]:
-            raise SystemExit(f"{path}: {name} is {content.get(name)!r}; expected text")
-    if content["scene"] != path.stem:
-        raise SystemExit(f"{path}: scene is {content['scene']!r}; expected the name of the file, {path.stem!r}")
-    fov = content.get("field_of_view")
-    if not _is_number(fov) or not FIELDS_OF_VIEW[0] <= fov <= FIELDS_OF_VIEW[1]:
-        low, high = FIELDS_OF_VIEW
-        raise SystemExit(f"{path}: field_of_view is {fov!r}; expected degrees from {low:g} to {high:g}")
-    up = _vector(path, "up", content.get("up"))
-    if not bool(up.any()):
-        raise SystemExit(f"{path}: up is {content['up']}; expected a direction")
-    views = content.get("views")
-    if not isinstance(views, list) or not views:
-        raise SystemExit(f"{path}: views is {views!r}; expected a list of eye and at")
-    ends: dict[str, list[Tensor]] = {"eye": [], "at": []}
-    for number, view in enumerate(views):
-        for name, found in ends.items():
-            value = view.get(name) if isinstance(view, dict) else None
-            found.append(_vector(path, f"{name} of view {number}", value))
-        if torch.equal(ends["eye"][-1], ends["at"][-1]):
-            raise SystemExit(f"{path}: view {number} looks at its own eye, {view['eye']}; expected two places")
-    return CameraPath(content["scene"], content["about"], up, fov, torch.stack(ends["eye"]), torch.stack(ends["at"]))
+        eyes, ats = (_vectors([view[end] for view in content["views"]]) for end in ("eye", "at"))
+        found = CameraPath(content["scene"], content["about"], _vectors([content["up"]])[0], 0.0, eyes, ats)
+        found = replace(found, field_of_view=float(content["field_of_view"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SystemExit(
+            f"{path}: not a camera path of {path.stem} ({error!r}); expected scene, about, up, field_of_view, and "
+            "views of eye and at"
+        ) from error
+    low, high = FIELDS_OF_VIEW
+    wrong = {
+        f"scene is {found.scene!r}": found.scene != path.stem,
+        f"field_of_view is {found.field_of_view:g}, not from {low:g} to {high:g}": not low
+        <= found.field_of_view
+        <= high,
+        "up has no direction": not bool(found.up.any()),
+        "a view looks at its own eye": bool((found.eyes == found.ats).all(1).any()),
+    }
+    if any(wrong.values()):
+        raise SystemExit(f"{path}: {', '.join(what for what, so in wrong.items() if so)}")
+    return found
+
+
+def _vectors(values: list[list[float]]) -> Tensor:
+    """Finite vectors, (C, 3) float64. Raises ValueError or TypeError if they are none."""
+    found = torch.tensor(values, dtype=torch.float64)
+    if found.ndim != 2 or found.shape[1] != 3 or not len(found) or not bool(found.isfinite().all()):
+        raise ValueError(f"vectors of shape {tuple(found.shape)}; expected three finite numbers each")
+    return found
 
 
 def views_of(path: Path, width: int) -> Views:
@@ -139,14 +137,3 @@ def write_sheet(scene: Gaussians, path: Path, target: Path) -> None:
         draw.text((corner[0] + 3, corner[1] + 2), str(number), fill=(255, 255, 0))
     with replacing(target) as part:
         sheet.save(part, format="PNG")
-
-
-def _vector(path: Path, name: str, value: Any) -> Tensor:
-    """Three finite numbers, (3,) float64."""
-    if not (isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))):
-        raise SystemExit(f"{path}: {name} is {value!r}; expected three finite numbers")
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -16,19 +16,20 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
+from rich.table import Table
 
-from lab.common.compare import lpips_or_none
-from lab.common.printing import console
+from lab.common.compare import METRICS, lpips_or_none
+from lab.common.printing import console, megabytes, number, percent, table
 from lab.common.results import Results, Row
-from lab.common.ways import Way, count_of, programs_of
+from lab.common.scenes import JUDGED, TUNING, group_of
+from lab.common.ways import WAYS, Reducer, Way, count_of, programs_of
 from lab.judge.camera_paths import path_of, write_sheet
-from lab.judge.scenes import MEASURES, JudgedScene, check, load, losses
-from lab.judge.tables import COSTS, lead_tables, mean_tables, ordered, scene_list, scene_table, summaries
-from lab.tables.making import Reducer
+from lab.judge.record import Figures, at_order, section
+from lab.judge.scenes import MEASURES, JudgedScene, check, check_options, known_rows, load, losses
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
@@ -36,20 +37,26 @@ from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.system.programs import ProgramFailed
 from pointsplat_ns.system.progress import tracked
 
-LEAST_WIDTH = 20
-"""Pixels: a lower picture is smaller than SSIM's window."""
-
 Task = tuple[float, Reducer]
 """A share of the Gaussians to keep, and what makes the scene smaller."""
 
 
-def known_rows(results: Results, scene: JudgedScene) -> list[Row]:
-    """The rows of a scene that are there, if scene and path are the same."""
-    known = results.of(scene.name)
-    same = [row for row in known if row["digest"] == scene.digest]
-    if known and not same:
-        print(f"{scene.name}: not the scene or the path that {results.path} has; measured anew")
-    return same
+COSTS = ("seconds", "cpu_seconds", "peak_bytes")
+"""What making a scene smaller took."""
+
+HEADS = {
+    "covered_psnr": ("covered PSNR", number(2)),
+    **{
+        f"{target}_{name}": (f"{prefix}{name.upper()}", number(2 if name == "psnr" else 3))
+        for target, prefix in (("dense", ""), ("photo", "photo "))
+        for name in METRICS
+    },
+    "count": ("splats", number(0)),
+    "seconds": ("s", number(1)),
+    "cpu_seconds": ("CPU s", number(1)),
+    "peak_bytes": ("MB", megabytes),
+}
+"""Columns by what a row calls them: their heads, and how a value is written."""
 
 
 def tasks_of(
@@ -84,8 +91,8 @@ def rows_of(scene: JudgedScene, path: Path, tasks: list[Task], lpips: Lpips | No
     rows = [about for about, small in reduced if small is None]
     done = [(about, small) for about, small in reduced if small is not None]
     found = losses(scene, [small for _, small in done], lpips)
-    for number, look, measures in tracked(found, f"{scene.name}: compared", len(done) * len(scene.looks)):
-        rows.append(done[number][0] | {"at": look.at, "views": len(look.views)} | measures)
+    for index, look, measures in tracked(found, f"{scene.name}: compared", len(done) * len(scene.looks)):
+        rows.append(done[index][0] | {"at": look.at, "views": len(look.views)} | measures)
     return rows
 
 
@@ -103,11 +110,42 @@ def _reduced(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[tupl
             try:
                 small, usage = way.reduce(source, count_of(keep, len(scene.dense)))
             except (ProgramFailed, SceneError) as error:
-                print(f"{scene.name}: {way.label} at {100 * keep:g} % failed: {error}", flush=True)
+                print(f"{scene.name}: {way.label} at {percent(keep)} failed: {error}", flush=True)
                 nothing = dict.fromkeys(("count", *COSTS, *MEASURES))
                 yield about | {"failed": str(error), "at": scene.looks[0].at} | nothing, None
                 continue
             yield about | {"count": len(small)} | vars(usage), small
+
+
+def ordered(rows: list[Row]) -> list[Row]:
+    """Rows of a scene by width, then by budget, our own ways first."""
+    ours = list(WAYS)
+
+    def key(row: Row) -> Any:
+        method = row["method"]
+        return at_order(row["at"]), -row["keep"], (ours.index(method) if method in ours else len(ours), method)
+
+    return sorted(rows, key=key)
+
+
+def scene_table(rows: list[Row]) -> Table:
+    """The rows of one scene; a dash for what cannot be had, no column for what none has."""
+    columns = [name for name in HEADS if any(row.get(name) is not None for row in rows)]
+    lines = [
+        [row["at"], percent(row["keep"]), row["method"], *(HEADS[name][1](row.get(name)) for name in columns)]
+        for row in rows
+    ]
+    title = f"{rows[0]['scene']}: against the dense scene's renders; MB: peak memory; photos last"
+    return table(title, ["at", "kept", "way", *(HEADS[column][0] for column in columns)], lines, left=["way"])
+
+
+def scene_list() -> Table:
+    """Which scenes are for tuning and which judge, and which have a camera path."""
+    others = sorted({path.stem for path in path_of("").parent.glob("*.json")} - {*TUNING, *JUDGED})
+    names = (*TUNING, *JUDGED, *others)
+    lines = [(n, group_of(n) or "other", path_of(n).name if path_of(n).is_file() else "-") for n in names]
+    heads = ("scene", "for", "camera path")
+    return table("scenes; those with photos are judged in the poses of held-out photos", heads, lines, heads)
 
 
 def write_sheets(scenes: tuple[Path, ...], folder: Path) -> None:
@@ -153,15 +191,10 @@ def main(
     if list_scenes:
         console().print(scene_list())
         return
-    if not scenes:
-        raise SystemExit("no scene named; expected PLY files or runs, or --list")
     if sheet is not None:
         write_sheets(scenes, sheet)
         return
-    if not all(0 < share <= 1 for share in keep):
-        raise SystemExit(f"--keep {' '.join(map(str, keep))}; expected shares above 0, at most 1")
-    if views < 1 or not widths or min(widths) < LEAST_WIDTH:
-        raise SystemExit(f"{views} views of widths {widths}; expected at least 1, and {LEAST_WIDTH} pixels")
+    check_options(scenes, keep, views, widths)
     programs = programs_of(ways, splat_transform)
     labels = [program.label for program in programs]
     if unknown := {*again} - {*labels}:
@@ -170,7 +203,7 @@ def main(
         raise SystemExit("--again without --resume; expected the file whose other rows stay")
     names = check(scenes)
     network = lpips_or_none(lpips)
-    results = Results(json_path, {"views": views, "lpips": network is not None}, resume, summaries)
+    results = Results(json_path, {"views": views, "lpips": network is not None}, resume)
     shown: list[Row] = []
     for name, path in zip(names, scenes, strict=True):
         scene = load(path, widths, views)
@@ -185,8 +218,8 @@ def main(
         rows = [row for row in results.of(name) if row["keep"] in keep and row["at"] in at]
         console().print(scene_table(rows))
         shown += rows
-    for found in (*(mean_tables(shown) if len(scenes) > 1 else ()), *lead_tables(shown)):
-        console().print(found)
+    figures = Figures(shown)
+    print("\n\n".join(section(figures, at) for at in figures.ats))
 
 
 if __name__ == "__main__":

@@ -10,22 +10,25 @@ Rows of camera paths go to ``judge.json``, rows of held-out photos to ``judge_ph
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
+import pandas as pd
 import tyro
 
-from lab.common.printing import markdown
+from lab.common.printing import markdown, percent
 from lab.common.results import Row, grouped
 from lab.common.scenes import group_of
 from lab.common.ways import PEER
 from lab.judge.scenes import LPIPS_WIDTH, MEASURES, PHOTOS
-from lab.judge.tables import AHEAD, all_leads, at_order, means
 from pointsplat_ns.io.files import replacing
 
 ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "docs" / "record"
+
+AHEAD = {"covered_psnr": "against the dense scene's renders", "photo_psnr": "against held-out photos"}
+"""What leads are taken of, and its name."""
 
 OURS = ("prune", "compact")
 """Our ways, as rows call them."""
@@ -102,68 +105,59 @@ def write_rows(rows: list[Row], settings: dict[str, Any], target: Path) -> None:
         part.write_text(f'{{"settings": {json.dumps(settings)}, "rows": [\n{lines}\n]}}\n', "utf-8")
 
 
-def complete(rows: list[Row]) -> list[Row]:
-    """The rows of those scenes, widths and budgets that have every one of :data:`WAYS`."""
-    result = []
-    for same in grouped(rows, lambda row: (row["scene"], row["at"], row["keep"])).values():
-        measured = [row for row in same if not row["failed"]]
-        there = {PEER if row["method"].startswith(PEER) else row["method"] for row in measured}
-        if there >= {*WAYS}:
-            result += measured
-    return result
-
-
-def best_peers(rows: list[Row]) -> Iterator[Row]:
-    """One row of splat-transform for each scene, width and budget: the best of its modes by each measure, and the costs
-    of the mode of the best PSNR."""
-    peers = [row for row in rows if row["method"].startswith(PEER)]
-    for same in grouped(peers, lambda row: (row["scene"], row["at"], row["keep"])).values():
-        found = dict(max(same, key=lambda row: row["covered_psnr"]), method=PEER)
-        for name in MEASURES:
-            known = [row[name] for row in same if row[name] is not None]
-            if known:
-                found[name] = (min if name.endswith("lpips") else max)(known)
-        yield found
+def compared(rows: list[Row]) -> pd.DataFrame:
+    """Measures and costs by scene, width, budget and way, of the scenes, widths and budgets that have every one of
+    :data:`WAYS`. splat-transform has the best of its modes by each measure, and the costs of that of the best PSNR."""
+    table = pd.DataFrame([row for row in rows if not row["failed"]])
+    table["way"] = table["method"].where(~table["method"].str.startswith(PEER), PEER)
+    table = table[table["way"].isin(WAYS)].sort_values("covered_psnr", ascending=False, kind="stable")
+    place = ["scene", "at", "keep"]
+    groups = table[table.groupby(place)["way"].transform("nunique") == len(WAYS)].groupby([*place, "way"])
+    found = groups.first()
+    for name in MEASURES:
+        found[name] = groups[name].min() if name.endswith("lpips") else groups[name].max()
+    return found
 
 
 class Figures:
-    """Means and leads over scenes.
+    """Figures of all scenes, by width and budget.
 
     Args:
         rows: of any scenes, widths, budgets and ways.
     """
 
     def __init__(self, rows: list[Row]):
-        self.rows = complete(rows)
-        shown = [*best_peers(self.rows), *(row for row in self.rows if row["method"] in OURS)]
-        self.ats = sorted({row["at"] for row in shown}, key=at_order)
-        self.keeps = sorted({row["keep"] for row in shown}, reverse=True)
-        # Groups come in order, "all" last if there are several: the last one is that of all scenes.
-        self.means: dict[tuple[Any, ...], Row] = {}
-        for at in self.ats:
-            here = means([row for row in shown if row["at"] == at])
-            self.means |= {(at, mean["keep"], mean["method"]): mean for mean in here}
-        self.leads = grouped(all_leads(self.rows), lambda lead: (lead["method"], lead["at"]))
+        self.table = compared(rows)
+        self.ats = sorted(set(self.table.index.get_level_values("at")), key=at_order)
+        self.keeps = sorted(set(self.table.index.get_level_values("keep")), reverse=True)
+
+    def of(self, at: int | str, column: str) -> pd.DataFrame:
+        """A figure at a width: rows by budget and scene, a column for each way."""
+        return self.table.xs(at, level="at")[column].astype(float).unstack("way").dropna().swaplevel().sort_index()
 
     def scenes(self, at: int | str) -> str:
         """How many scenes there are at a width: a number, or a span if budgets differ."""
-        counts = {mean["scenes"] for (where, _, _), mean in self.means.items() if where == at}
+        counts = set(self.of(at, "covered_psnr").groupby("keep").size())
         return f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(*counts)
 
-    def lead(self, method: str, at: int | str, column: str) -> dict[float, tuple[float, float, str]]:
-        """By budget: mean lead of a way in dB, the least one, and the scene that has it."""
-        known = [lead for lead in self.leads.get((method, at), []) if column in lead]
-        found = {}
-        for keep, same in grouped(known, lambda lead: lead["keep"]).items():
-            least = min(same, key=lambda lead: lead[column])
-            found[keep] = (fmean(lead[column] for lead in same), least[column], least["scene"])
-        return found
+    def lead(self, method: str, at: int | str, column: str) -> pd.Series:
+        """Lead in dB of ``prune`` over splat-transform or of ``compact`` over ``prune``, by budget and scene."""
+        values = self.of(at, column)
+        return values[method] - values[PEER if method == "prune" else "prune"]
 
-    def worst_lead(self, method: str, keep: float, ats: list[int | str]) -> tuple[float, str, int | str] | None:
-        """The least lead at a budget over several widths: dB, the scene, the width."""
-        found = [(at, self.lead(method, at, "covered_psnr").get(keep)) for at in ats]
-        known = [(lead[1], lead[2], at) for at, lead in found if lead is not None]
-        return min(known, key=lambda lead: lead[0], default=None)
+
+def summed_up(values: pd.Series, digits: int, sign: str = "", worst: str = "min") -> dict[float, str]:
+    """By budget: the mean of a figure over scenes, and in brackets the worst and its scene."""
+    return {
+        keep: f"{same.mean():{sign}.{digits}f} ({same.agg(worst):{sign}.{digits}f} {same.agg(f'idx{worst}')})"
+        for keep, same in values.groupby("keep")
+        for same in [same.droplevel("keep")]
+    }
+
+
+def at_order(at: int | str) -> tuple[bool, int | str]:
+    """Sorts widths, with photos last."""
+    return isinstance(at, str), at
 
 
 def page(rows: list[Row], settings: dict[str, Any]) -> str:
@@ -175,27 +169,31 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
             views=settings["views"], peer=PEER, modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes)
         ),
         "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
+        *(section(figures, at) for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH),
     ]
-    widest = max((at for at in figures.ats if at != PHOTOS), default=None)
-    for at in (at for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH):
-        title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
-        parts.append(f"## {title}\n\n{_count(figures.scenes(at))}.")
-        if at in (PHOTOS, widest):
-            parts.append("PSNR against renders of the dense scene:\n\n" + _mean_table(figures, at, "covered_psnr", 2))
-        if at == PHOTOS:
-            parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
-        for column, where in AHEAD.items():
-            if table := _lead_table(figures, at, column):
-                parts.append(f"Leads in dB {where}:\n\n{table}")
-        if at == LPIPS_WIDTH and (table := _mean_table(figures, at, "dense_lpips", 3)):
-            parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
     if table := _unlearned_table(rows, figures):
         parts.append("## Scenes that the network was not trained on\n\n" + UNLEARNED + "\n\n" + table)
     parts.append("## Time\n\n" + TIME + "\n\n" + _cost_table(figures))
     if failed := [row for row in rows if row["failed"]]:
-        lines = "\n".join(f"- {row['scene']}, {_share(row['keep'])}: {row['method']}" for row in failed)
+        lines = "\n".join(f"- {row['scene']}, {percent(row['keep'])}: {row['method']}" for row in failed)
         parts.append(f"## Failed\n\n{lines}")
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def section(figures: Figures, at: int | str) -> str:
+    """What the page says of one width, or of held-out photos."""
+    title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
+    parts = [f"## {title}", f"{_count(figures.scenes(at))}."]
+    if at in (PHOTOS, *[other for other in figures.ats if other != PHOTOS][-1:]):
+        parts.append("PSNR against renders of the dense scene:\n\n" + _mean_table(figures, at, "covered_psnr", 2))
+    if at == PHOTOS:
+        parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
+    for column, where in AHEAD.items():
+        if table := _lead_table(figures, at, column):
+            parts.append(f"Leads in dB {where}:\n\n{table}")
+    if at == LPIPS_WIDTH and (table := _mean_table(figures, at, "dense_lpips", 3)):
+        parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
+    return "\n\n".join(parts)
 
 
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
@@ -216,10 +214,10 @@ splat-transform stands for the mode of the best PSNR."""
 
 
 def _scene_table(rows: list[Row], figures: Figures) -> str:
-    lines, missing = [], []
+    lines, missing, shown = [], [], figures.table.index.droplevel("way")
     for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
-        there = {row["keep"] for row in figures.rows if row["scene"] == scene}
-        if gaps := [_share(keep) for keep in figures.keeps if keep not in there]:
+        there = set(shown[shown.get_level_values("scene") == scene].get_level_values("keep"))
+        if gaps := [percent(keep) for keep in figures.keeps if keep not in there]:
             missing.append(f"{scene} at {', '.join(gaps)}")
         where = "held-out photos" if at else "camera path"
         lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other"])
@@ -230,53 +228,50 @@ def _scene_table(rows: list[Row], figures: Figures) -> str:
     return table + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
 
 
+def _by_budget(figures: Figures, head: str, columns: dict[str, dict[float, str]]) -> str:
+    """A table with a row for each budget that has all columns; empty if none has."""
+    keeps = [keep for keep in figures.keeps if all(keep in column for column in columns.values())]
+    lines = [[percent(keep), *(column[keep] for column in columns.values())] for keep in keeps]
+    return markdown([head, *columns], lines) if lines else ""
+
+
 def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
-    lines = []
-    for keep in figures.keeps:
-        means = [figures.means.get((at, keep, way), {}) for way in WAYS]
-        if all(column in mean for mean in means):
-            cells = [
-                f"{mean[column]:.{digits}f} ({mean[f'{column}_worst']:.{digits}f} {mean[f'{column}_worst_scene']})"
-                for mean in means
-            ]
-            lines.append([_share(keep), *cells])
-    return markdown(["kept", *map(_way, WAYS)], lines) if lines else ""
+    values, worst = figures.of(at, column), "max" if column.endswith("lpips") else "min"
+    return _by_budget(figures, "kept", {_way(way): summed_up(values[way], digits, "", worst) for way in WAYS})
 
 
 def _lead_table(figures: Figures, at: int | str, column: str) -> str:
-    ours, repaired = (figures.lead(method, at, column) for method in OURS)
-    lines = []
-    for keep in figures.keeps:
-        if keep in ours and keep in repaired:
-            leads = (ours[keep], repaired[keep])
-            lines.append([_share(keep), *(f"{mean:+.2f} ({least:+.2f} {scene})" for mean, least, scene in leads)])
-    heads = ["kept", f"`prune` over {PEER}", "`compact` over `prune`"]
-    return markdown(heads, lines) if lines else ""
+    ours, repaired = (summed_up(figures.lead(method, at, column), 2, "+") for method in OURS)
+    return _by_budget(figures, "kept", {f"`prune` over {PEER}": ours, "`compact` over `prune`": repaired})
 
 
 def _unlearned_table(rows: list[Row], figures: Figures) -> str:
     others = Figures([row for row in rows if row["scene"] not in LEARNED])
     lines = []
-    for at in figures.ats:
-        without, gains = (each.lead("compact", at, "covered_psnr") for each in (others, figures))
-        if without:
-            cells = [f"{without[keep][0]:+.2f} ({gains[keep][0]:+.2f})" for keep in figures.keeps if keep in without]
-            lines.append([str(at), *cells])
-    return markdown(["width", *map(_share, others.keeps)], lines) if lines else ""
+    for at in others.ats:
+        without, gains = (each.lead("compact", at, "covered_psnr").groupby("keep").mean() for each in (others, figures))
+        cells = [f"{without[keep]:+.2f} ({gains[keep]:+.2f})" for keep in figures.keeps if keep in without]
+        lines.append([str(at), *cells])
+    return markdown(["width", *map(percent, others.keeps)], lines) if lines else ""
 
 
 def _cost_table(figures: Figures) -> str:
     lines = []
-    at = {photos: next((at for at in figures.ats if (at == PHOTOS) == photos), None) for photos in (False, True)}
-    for kind, where in (("splats", at[False]), ("captures", at[True])):
-        for keep in (0.5, 0.1):
-            means = [mean for way in WAYS if (mean := figures.means.get((where, keep, way))) is not None]
-            if len(means) == len(WAYS):
-                seconds, memory = (
-                    [f"{scale * mean[name]:.{digits}f} ({scale * mean[f'{name}_worst']:.{digits}f})" for mean in means]
-                    for name, scale, digits in (("cpu_seconds", 1, 0), ("peak_bytes", 1e-9, 2))
+    for kind, photos in (("splats", False), ("captures", True)):
+        for at in [at for at in figures.ats if (at == PHOTOS) == photos][:1]:
+            cells = []
+            for name, scale, digits in (("cpu_seconds", 1, 0), ("peak_bytes", 1e-9, 2)):
+                found = (scale * figures.of(at, name)).groupby("keep").agg(["mean", "max"])
+                cells.append(
+                    {
+                        keep: " / ".join(
+                            f"{found.loc[keep, (way, 'mean')]:.{digits}f} ({found.loc[keep, (way, 'max')]:.{digits}f})"
+                            for way in WAYS
+                        )
+                        for keep in found.index
+                    }
                 )
-                lines.append([kind, _share(keep), " / ".join(seconds), " / ".join(memory)])
+            lines += [[kind, percent(keep), *(cell[keep] for cell in cells)] for keep in (0.5, 0.1) if keep in cells[0]]
     ways = " / ".join(map(_way, WAYS))
     return markdown(["scenes", "kept", f"CPU seconds: {ways}", "GB"], lines) if lines else ""
 
@@ -286,17 +281,20 @@ def readme_table(rows: list[Row]) -> str:
     figures = Figures(rows)
     lines = []
     for at in (at for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH):
-        cells = []
-        for keep in figures.keeps:
-            found = [figures.means.get((at, keep, way)) for way in WAYS]
-            known = [f"{mean['covered_psnr']:.1f}" for mean in found if mean is not None]
-            cells.append(" / ".join(known) or "-")
+        means = figures.of(at, "covered_psnr").groupby("keep").mean()
         name = "poses of held-out photos" if at == PHOTOS else f"{at} pixels wide"
+        cells = [
+            " / ".join(f"{means.loc[keep, way]:.1f}" for way in WAYS) if keep in means.index else "-"
+            for keep in figures.keeps
+        ]
         lines.append([f"{name} ({_count(figures.scenes(at))})", *cells])
     for method, what in (("prune", "worst lead of `prune`"), ("compact", "worst gain by `compact`")):
-        worst = [figures.worst_lead(method, keep, figures.ats) for keep in figures.keeps]
-        lines.append([what, *("-" if lead is None else f"{lead[0]:+.1f} ({lead[1]}, {lead[2]})" for lead in worst)])
-    return markdown(["kept", *map(_share, figures.keeps)], lines)
+        leads = pd.concat({at: figures.lead(method, at, "covered_psnr") for at in figures.ats}, names=["at"])
+        worst = {keep: (same.min(), same.idxmin()) for keep, same in leads.groupby("keep")}
+        lines.append(
+            [what, *(f"{worst[keep][0]:+.1f} ({worst[keep][1][2]}, {worst[keep][1][0]})" for keep in figures.keeps)]
+        )
+    return markdown(["kept", *map(percent, figures.keeps)], lines)
 
 
 def put_between(text: str, new: str, path: Path) -> str:
@@ -315,17 +313,13 @@ def _count(scenes: str) -> str:
     return f"{scenes} scene{'' if scenes == '1' else 's'}"
 
 
-def _share(keep: float) -> str:
-    return f"{100 * keep:g} %"
-
-
 def _way(way: str) -> str:
     return f"`{way}`" if way in OURS else way
 
 
 def main(
     files: tyro.conf.Positional[tuple[Path, ...]],
-    record: Path = ROOT / "docs" / "record",
+    record: Path = FOLDER,
     readme: Path = ROOT / "README.md",
 ) -> None:
     """Write the record of what judge.py measured.
@@ -336,7 +330,7 @@ def main(
         readme: the page that has a table between two marks.
     """
     rows, settings = read(files)
-    if not complete(rows):
+    if compared(rows).empty:
         raise SystemExit(f"{', '.join(map(str, files))}: no scene has {', '.join(WAYS)} at one budget")
     with_table = put_between(readme.read_text("utf-8"), readme_table(rows), readme)
     record.mkdir(parents=True, exist_ok=True)

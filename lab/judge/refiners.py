@@ -9,6 +9,7 @@ nothing checks them: ``pointsplat compact`` would leave out what does harm.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from statistics import fmean, stdev
@@ -18,11 +19,9 @@ import torch
 import tyro
 
 import pointsplat_ns as ps
-from lab.common.printing import console, start, table
+from lab.common.printing import console, percent, start, table
 from lab.common.results import Results, Row, grouped
-from lab.judge.ablation import Judge
-from lab.judge.judge import LEAST_WIDTH
-from lab.judge.scenes import check, load
+from lab.judge.scenes import DenseViews, check, check_options, load
 
 HEADS = ("refiner", "selection", "kept", "trainings", "gain, dB", "spread, dB")
 
@@ -44,7 +43,7 @@ def lines(rows: Iterable[Row]) -> list[list[str]]:
         one_each = grouped(members, lambda row: row["number"]).values()
         gains = [fmean(row["psnr"] - row["pruned_psnr"] for row in of_one) for of_one in one_each]
         spread = f"{stdev(gains):.2f}" if len(gains) > 1 else "-"
-        found.append([name, by, f"{100 * keep:g} %", str(len(gains)), f"{fmean(gains):+.2f}", spread])
+        found.append([name, by, percent(keep), str(len(gains)), f"{fmean(gains):+.2f}", spread])
     return found
 
 
@@ -69,21 +68,18 @@ def main(
         views: at most so many views of each scene, evenly spread.
         json_path: write all rows there, after each scene.
     """
-    if views < 1 or width < LEAST_WIDTH or not all(0 < share <= 1 for share in keep):
-        raise SystemExit(
-            f"{views} views of width {width}, --keep {keep}; expected 1, {LEAST_WIDTH}, and shares up to 1"
-        )
+    check_options(scenes, keep, views, (width,))
     networks = [(name, ps.load_refiner(None if path == "shipped" else path)) for name, path in map(named, refiners)]
     results = Results(json_path, {"views": views, "width": width}, resume=False)
     for scene_name, path in zip(check(scenes), scenes, strict=True):
         scene = load(path, (width,), views)
-        judge, rows = Judge(scene), []
-        for method, share in ((method, share) for method in by for share in keep):
+        dense, rows = DenseViews(scene.dense, scene.looks[0].views), []
+        for method, share in itertools.product(by, keep):
             small = ps.prune(scene.dense, keep=share, by=method)
-            pruned = judge.psnr(small)
+            pruned = dense.psnr(small)
             for number, (name, network) in enumerate(networks):
                 row: Row = {"scene": scene_name, "digest": scene.digest, "keep": share, "by": method, "method": name}
-                gained = judge.psnr(ps.refine(small, network))
+                gained = dense.psnr(ps.refine(small, network))
                 rows.append(row | {"number": number, "count": len(small), "pruned_psnr": pruned, "psnr": gained})
         results.put(scene_name, rows)
         console().print(table(scene_name, HEADS, lines(rows), left=HEADS[:2]))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lab.common.compare import METRICS, metrics_of, photos_of
+from lab.common.results import Results, Row
 from lab.common.scenes import name_of
 from lab.judge.camera_paths import path_of, views_of
 from pointsplat_ns.gaussians import Gaussians
@@ -28,6 +29,9 @@ PHOTOS = "photos"
 
 LPIPS_WIDTH = 960
 """Width, pixels, above which LPIPS is not computed: it would take longer than all else."""
+
+LEAST_WIDTH = 20
+"""Pixels: a lower picture is smaller than SSIM's window."""
 
 MEASURES = ("covered_psnr", *(f"{against}_{column}" for against in ("dense", "photo") for column in METRICS))
 """What is measured: PSNR of what the dense scene covers (:func:`covered_psnr`); then each metric over all pixels,
@@ -100,6 +104,48 @@ def check(paths: tuple[Path, ...]) -> list[str]:
         if path.suffix == ".ply":
             views_of(path_of(path.stem), 16)
     return names
+
+
+def check_options(scenes: tuple[Path, ...], keep: tuple[float, ...], views: int, widths: tuple[int, ...]) -> None:
+    """Check what a program is asked for.
+
+    Raises:
+        SystemExit: if there is no scene, or a share, the number of views or a width means nothing.
+    """
+    if not scenes:
+        raise SystemExit("no scene named; expected PLY files or runs")
+    if not all(0 < share <= 1 for share in keep):
+        raise SystemExit(f"--keep {' '.join(map(str, keep))}; expected shares above 0, at most 1")
+    if views < 1 or not widths or min(widths) < LEAST_WIDTH:
+        raise SystemExit(f"{views} views of widths {widths}; expected at least 1, and {LEAST_WIDTH} pixels")
+
+
+def known_rows(results: Results, scene: JudgedScene) -> list[Row]:
+    """The rows of a scene that are there, if scene and path are the same."""
+    known = results.of(scene.name)
+    same = [row for row in known if row["digest"] == scene.digest]
+    if known and not same:
+        print(f"{scene.name}: not the scene or the path that {results.path} has; measured anew")
+    return same
+
+
+class DenseViews:
+    """Views of a dense scene that show it, drawn once.
+
+    Raises:
+        SystemExit: if no view shows the scene.
+    """
+
+    def __init__(self, dense: Gaussians, views: Views):
+        drawn = [(view, *render_with_alpha(dense, view)) for view in views]
+        self.views = [(v, image, share) for v, image, alpha in drawn if (share := float(alpha.double().mean()))]
+        if not self.views:
+            raise SystemExit("no view shows the scene; expected at least one")
+
+    @torch.no_grad()
+    def psnr(self, small: Gaussians) -> float:
+        """Mean over views of :func:`covered_psnr`, dB."""
+        return fmean(covered_psnr(render(small, view), image, share) for view, image, share in self.views)
 
 
 @torch.no_grad()

@@ -11,24 +11,20 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from lab.common.printing import markdown, start
 from lab.judge import refiners
-from lab.tables.cells import About, Cell
-from lab.tables.layout import Layout, Table, figure_medians, markdown_table
-from lab.tables.means import Group, SceneCells
-from lab.tables.outputs import medians, plot_figure
+from lab.judge.record import FOLDER
+from lab.tables.cells import Tables
+from lab.tables.figure import plot_figure
+from lab.tables.layout import Layout, Table, markdown_table
 from lab.tables.ways import WAYS
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.tradeoff.points import restored_point
 
-ROOT = Path(__file__).parents[2]
-
-TABLES = (1, 3, 4)
-"""Tables of quality. Table 2 has times, which need an idle machine."""
+TIMES = 2
+"""Number of the table that is left out: times need an idle machine."""
 
 LEFT_OUT = ("PSNR (renders)", "SSIM (renders)", "LPIPS (renders)", "loses most")
 """Columns that the page leaves to the measured rows."""
@@ -75,76 +71,59 @@ ns-train pointsplat --data scenes --pipeline.datamanager.supervision dense --pip
 """
 
 
-def read(path: Path) -> list[Group]:
-    """The groups of scenes of a file that lab.tables wrote, without the cells of ``prune`` and ``compact``.
+def read(path: Path) -> Tables:
+    """The tables of a file that lab.tables wrote, without the cells of ``prune`` and ``compact``.
 
     Raises:
         SystemExit: if the file cannot be read or is none.
     """
-    left_out = {WAYS.merge.name, WAYS.compact.name}
     try:
-        content = json.loads(path.read_text("utf-8"))
-        cells = [_cell(values) for values in content["cells"] if values["way"] not in left_out]
-        scenes: dict[str, list[SceneCells]] = {name: [] for name in content["groups"]}
-        for about in (About(**values) for values in content["scenes"]):
-            own = {(cell.way, cell.point.share): cell for cell in cells if cell.point.key.startswith(f"{about.name}/")}
-            scenes[about.group].append(SceneCells(about, own))
+        tables = Tables.of(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SystemExit(
             f"{path}: cannot be read ({error!r}); expected tables.json of `python -m lab.tables`"
         ) from error
-    return [Group(name, tuple(members)) for name, members in scenes.items()]
+    left_out = {WAYS.merge.name, WAYS.compact.name}
+    tables.cells = {key: cell for key, cell in tables.cells.items() if cell["way"] not in left_out}
+    return tables
 
 
-def _cell(values: dict[str, Any]) -> Cell:
-    return Cell(**{**values, "point": restored_point(values["point"])})
-
-
-def tables_of(group: Group) -> list[Table]:
-    """The tables of a group, without rows that were not measured."""
-    found = [_shortened(table) for table in Layout(group, (), {}).tables() if table.number in TABLES]
-    if known := medians(group):
-        found.append(figure_medians(group, known))
-    return found
-
-
-def _shortened(table: Table) -> Table:
+def shortened(table: Table) -> Table:
+    """A table without rows that were not measured, and without :data:`LEFT_OUT`."""
     shown = [column for column, name in enumerate(table.header) if name not in LEFT_OUT]
     return dataclasses.replace(
         table,
         header=tuple(table.header[column] for column in shown),
-        sections=tuple(
-            tuple(tuple(row[column] for column in shown) for row in rows if "not measured" not in row)
-            for rows in table.sections
-        ),
-        notes=(),
+        rows=[tuple(row[column] for column in shown) for row in table.rows if "not measured" not in row],
+        notes=[],
     )
 
 
-def page(groups: list[Group], encoders: Path) -> str:
+def page(tables: Tables, encoders: Path) -> str:
     """The page of all tables, that of encoders from the rows of a file of refiners.py."""
-    abouts = [scene.about for group in groups for scene in group.scenes]
+    abouts = list(tables.scenes.values())
     text = PAGE.format(
-        sizes=", ".join(f"{about.width} x {about.height} ({about.name})" for about in abouts),
-        machines="; ".join(sorted({about.machine for about in abouts})),
+        sizes=", ".join(f"{about['width']} x {about['height']} ({about['name']})" for about in abouts),
+        machines="; ".join(sorted({about["machine"] for about in abouts})),
     )
-    tables = [markdown_table(table) for group in groups for table in tables_of(group)]
-    figure = f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*\n"
+    layouts = [Layout(tables, group, names, ()) for group, names in tables.groups().items()]
+    shown = [markdown_table(shortened(table)) for each in layouts for table in each.tables() if table.number != TIMES]
+    figure = f"![Opacity and volume]({FIGURE})\n\n*Figure 4: opacity and volume of the Gaussians kept.*"
     compared = markdown(refiners.HEADS, refiners.lines(json.loads(encoders.read_text("utf-8"))["rows"]))
-    return "\n".join([text, *tables, figure, ENCODERS.format(table=compared)])
+    return "\n\n".join(part.strip() for part in (text, *shown, figure, ENCODERS.format(table=compared))) + "\n"
 
 
-def main(file: tyro.conf.Positional[Path], record: Path = ROOT / "docs" / "record") -> None:
+def main(file: tyro.conf.Positional[Path], record: Path = FOLDER) -> None:
     """Write the record of the paper's tables.
 
     Args:
         file: tables.json of ``python -m lab.tables``.
         record: folder for results.md and its figure.
     """
-    groups = read(file)
+    tables = read(file)
     with replacing(record / "results.md") as part:
-        part.write_text(page(groups, record / "encoders.json"), "utf-8")
-    plot_figure(groups, record / FIGURE)
+        part.write_text(page(tables, record / "encoders.json"), "utf-8")
+    plot_figure(tables.cells, tables.groups(), record / FIGURE)
     print(record / "results.md")
 
 

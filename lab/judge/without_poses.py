@@ -5,9 +5,9 @@ third.
     python -m lab.judge.without_poses RUN --keep 0.1 --ways prune --sets sampled all
 
 The run's PLY, exported to a folder of its own, is merged (``prune``) and repaired (``compact``), and compared with
-renders of the dense scene in the poses of held-out photos: at the photos' size, and at twice it. In a cell, these are
-beside one another. For each set of views, the rank correlation of visibility weights with minus the log of the size of
-Gaussians, and the median weight, say how well the views explain the scene; no held-out pose has a part in that.
+renders of the dense scene in the poses of held-out photos: at the photos' size, and at twice it. For each set of views,
+the rank correlation of visibility weights with minus the log of the size of Gaussians, and the median weight, say how
+well the views explain the scene; no held-out pose has a part in that.
 
 ``lab/judge/captures.py`` lists the captures, and how each is made ready and trained. Choose constants on those for
 tuning.
@@ -21,20 +21,18 @@ import time
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from statistics import fmean
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
+import pandas as pd
 import torch
 import tyro
 
 import pointsplat_ns as ps
-from lab.common.printing import console, number, start, table
-from lab.common.results import Results, Row, grouped
+from lab.common.printing import console, number, percent, start, table
+from lab.common.results import Results, Row
 from lab.common.scenes import group_of
 from lab.common.ways import WAYS, Way, count_of
-from lab.judge.ablation import Judge
-from lab.judge.judge import known_rows
-from lab.judge.scenes import PHOTOS, JudgedScene, Look, check, load
+from lab.judge.scenes import LEAST_WIDTH, DenseViews, JudgedScene, check, check_options, known_rows, load
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
@@ -63,12 +61,12 @@ WEIGHTS = "weights"
 OPAQUE = 0.1
 """Least opacity of the Gaussians whose weights and sizes are compared."""
 
-DIFFERENCES: dict[str, tuple[tuple[Way, ViewSet], tuple[Way, ViewSet]]] = {
-    "prune: sampled - all": (("prune", "sampled"), ("prune", "all")),
-    "compact: sampled - third": (("compact", "sampled"), ("compact", "third")),
-    "compact: sampled - all": (("compact", "sampled"), ("compact", "all")),
-    "sampled: compact - prune": (("compact", "sampled"), ("prune", "sampled")),
-    "all: compact - prune": (("compact", "all"), ("prune", "all")),
+DIFFERENCES = {
+    "prune: sampled - all": ("prune, sampled", "prune, all"),
+    "compact: sampled - third": ("compact, sampled", "compact, third"),
+    "compact: sampled - all": ("compact, sampled", "compact, all"),
+    "sampled: compact - prune": ("compact, sampled", "prune, sampled"),
+    "all: compact - prune": ("compact, all", "prune, all"),
 }
 """What is compared with what, each a way and a set of views."""
 
@@ -117,12 +115,6 @@ def explained(scene: Gaussians, views: Views | None) -> dict[str, float | None]:
     return {"correlation": correlation, "median": float(weights.median())}
 
 
-def tasks_of(keeps: tuple[float, ...], ways: tuple[Way, ...], sets: tuple[ViewSet, ...]) -> list[Task]:
-    """What is wanted of a run."""
-    weights: list[Task] = [(None, WEIGHTS, name) for name in sets]
-    return weights + [(keep, way, name) for keep in keeps for way in ways for name in sets]
-
-
 def task_of(row: Row) -> Task:
     """The task that a row is of."""
     return row["keep"], row["method"], row["views"]
@@ -132,27 +124,24 @@ def rows_of(scene: JudgedScene, path: Path, tasks: list[Task]) -> Iterator[Row]:
     """One row for each task."""
     poses = dataset_views(path, "train")
     [look] = scene.looks
-    judges: dict[str, Judge] = {}
+    judges: dict[str, DenseViews] = {}
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / f"{scene.name}.ply"
         write_ply(scene.dense, ply)
         for keep, method, name in tasks:
             row: Row = {"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense)}
             row |= {"keep": keep, "method": method, "views": name, "poses": len(poses)}
-            views, begin = chosen(name, poses), time.process_time()
+            views = chosen(name, poses)
             if keep is None:
                 yield row | explained(scene.dense, views)
                 continue
-            judges = judges or {measure: _judge(scene, look, size) for measure, size in SIZES.items()}
+            if not judges:
+                sizes = {"psnr": look.views, "twice_psnr": doubled(look.views)}
+                judges = {measure: DenseViews(scene.dense, seen) for measure, seen in sizes.items()}
             begin = time.process_time()
             small = _made(ply, count_of(keep, len(scene.dense)), method, views)
             row |= {"count": len(small), "cpu_seconds": time.process_time() - begin}
             yield row | {measure: judge.psnr(small) for measure, judge in judges.items()}
-
-
-def _judge(scene: JudgedScene, look: Look, size: int) -> Judge:
-    views = look.views if size == 1 else doubled(look.views)
-    return Judge(dataclasses.replace(scene, looks=(Look(PHOTOS, views),)))
 
 
 def _made(ply: Path, count: int, way: str, views: Views | None) -> Gaussians:
@@ -161,58 +150,49 @@ def _made(ply: Path, count: int, way: str, views: Views | None) -> Gaussians:
     return ps.compact(ply, count, effort="thorough" if way == "thorough" else "quick", views=views).scene
 
 
-def summaries(rows: list[Row]) -> dict[str, Any]:
+def wide(rows: list[Row]) -> pd.DataFrame:
+    """PSNR by share, measure and scene (rows), and by way with set of views (columns)."""
+    table = pd.DataFrame([row for row in rows if row["method"] != WEIGHTS])
+    table["way"] = table["method"] + ", " + table["views"]
+    long = table.melt(["keep", "scene", "way"], list(SIZES), var_name="measure", value_name="dB")
+    return long.pivot(index=["keep", "measure", "scene"], columns="way", values="dB")
+
+
+def differences(rows: list[Row]) -> list[Row]:
     """The :data:`DIFFERENCES` of each group of scenes, share and size: the mean over scenes, the worst, and its
     scene."""
-    values, found = _values(rows), []
-    groups = grouped(dict.fromkeys(row["scene"] for row in rows), lambda scene: group_of(scene) or "other")
-    keeps = sorted({keep for _, keep, *_ in values})
-    for group, keep, measure, (name, (of, to)) in product(groups, keeps, SIZES, DIFFERENCES.items()):
-        pairs = {scene: tuple(values.get((scene, keep, way, measure)) for way in (of, to)) for scene in groups[group]}
-        known = {scene: a - b for scene, (a, b) in pairs.items() if a is not None and b is not None}
-        if known:
-            worst = min(known, key=lambda scene: known[scene])
-            about = {"group": group, "scenes": len(known), "keep": keep, "measure": measure, "difference": name}
-            found.append(about | {"mean": fmean(known.values()), "worst": known[worst], "worst_scene": worst})
-    return {"differences": found}
-
-
-def _values(rows: list[Row]) -> dict[tuple[str, float, tuple[str, str], str], float]:
-    """PSNR by scene, share, way with set of views, and measure."""
-    kept = [row for row in rows if row["method"] != WEIGHTS]
-    return {
-        (row["scene"], row["keep"], (row["method"], row["views"]), measure): row[measure]
-        for row, measure in product(kept, SIZES)
-    }
+    values, found = wide(rows), []
+    for name, (of, to) in DIFFERENCES.items():
+        if {of, to} <= {*values.columns}:
+            known = (values[of] - values[to]).dropna().reset_index(name="dB").set_index("scene")
+            groups = known.index.map(lambda scene: group_of(scene) or "other")
+            for (keep, measure, group), same in known.groupby(["keep", "measure", groups])["dB"]:
+                about = {"group": group, "scenes": len(same), "keep": keep, "measure": measure, "difference": name}
+                found.append(about | {"mean": same.mean(), "worst": same.min(), "worst_scene": same.idxmin()})
+    return found
 
 
 def show(rows: list[Row]) -> None:
-    """Print a table for each share, with the mean and the worst over scenes; then weights and differences."""
-    values, scenes = _values(rows), list(dict.fromkeys(row["scene"] for row in rows))
-    for keep in sorted({keep for _, keep, *_ in values}):
-        there = {way for _, share, way, _ in values if share == keep}
-        ways = [way for way in product(WAYS, SETS) if way in there]
-        columns = []
-        for way in ways:
-            both = [tuple(values.get((scene, keep, way, measure)) for measure in SIZES) for scene in scenes]
-            of = [pair for pair in both if None not in pair]
-            columns.append([*both, *(tuple(map(over, zip(*of, strict=True))) for over in (fmean, min))])
-        lines = zip(
-            [*scenes, "mean", "worst"], *([" / ".join(map(DB, pair)) for pair in c] for c in columns), strict=True
-        )
-        heads = ("scene", *(f"{way}, {name}" for way, name in ways))
-        console().print(table(f"{100 * keep:g} %: PSNR at the photos' size / at twice it, dB", heads, lines))
+    """Print a table for each share and size, with the mean and the worst over scenes; then weights and differences."""
+    values = wide(rows)
+    order = [way for way in (f"{way}, {views}" for way, views in product(WAYS, SETS)) if way in values.columns]
+    for (keep, measure), same in values[order].groupby(["keep", "measure"]):
+        of_all = same.dropna()
+        lines = [(scene, *map(DB, line)) for (*_, scene), line in zip(same.index, same.to_numpy(), strict=True)]
+        lines += [("mean", *map(DB, of_all.mean())), ("worst", *map(DB, of_all.min()))]
+        title = f"{percent(keep)}: PSNR at {SIZES[measure]} x the photos' size, dB"
+        console().print(table(title, ("scene", *order), lines))
     weights = {(row["scene"], row["views"]): row for row in rows if row["method"] == WEIGHTS}
     lines = [
         (scene, *(" / ".join((DB(row.get("correlation")), number(4)(row.get("median")))) for row in same))
-        for scene in scenes
+        for scene in dict.fromkeys(row["scene"] for row in rows)
         for same in [[weights.get((scene, name), {}) for name in SETS]]
     ]
     console().print(table("weights: rank correlation with minus log size / median", ("scene", *SETS), lines))
     lines = [
-        (f"{row['group']}, {row['scenes']}", f"{100 * row['keep']:g} %", f"x {SIZES[row['measure']]}")
+        (f"{row['group']}, {row['scenes']}", percent(row["keep"]), f"x {SIZES[row['measure']]}")
         + (row["difference"], DB(row["mean"]), DB(row["worst"]), row["worst_scene"])
-        for row in summaries(rows)["differences"]
+        for row in differences(rows)
     ]
     heads = ("scenes", "kept", "size", "difference", "mean, dB", "worst, dB", "of")
     console().print(table("what views without poses cost", heads, lines, left=("difference", "of")))
@@ -240,16 +220,16 @@ def main(
         resume: take up the rows of that file. What it lacks is measured.
         again: sets of views that are measured though the file has them.
     """
-    if not all(0 < share <= 1 for share in keep) or views < 1:
-        raise SystemExit(f"--keep {' '.join(map(str, keep))} --views {views}; expected shares above 0, and 1 view")
+    check_options(runs, keep, views, (LEAST_WIDTH,))
     if others := [path for path in runs if path.suffix == ".ply"]:
         raise SceneError(f"{others[0]}: a PLY; expected a run, whose dataset has the poses")
     names = check(runs)
-    results = Results(json_path, {"views": views}, resume, summaries)
+    results = Results(json_path, {"views": views}, resume)
     for name, path in zip(names, runs, strict=True):
         scene = load(path, (), views)
         rows = {task_of(row): row for row in known_rows(results, scene)}
-        tasks = [task for task in tasks_of(keep, ways, sets) if task not in rows or task[-1] in again]
+        wanted: list[Task] = [(None, WEIGHTS, name) for name in sets] + list(product(keep, ways, sets))
+        tasks = [task for task in wanted if task not in rows or task[-1] in again]
         print(f"{name}: {len(scene.dense):,} Gaussians, {len(scene.looks[0].views)} held-out poses", flush=True)
         for row in tracked(rows_of(scene, path, tasks), name, len(tasks)):
             rows[task_of(row)] = row

@@ -1,1 +1,1 @@
-"""Errors of numbers: of float32 over decades, and of file formats."""
+"""Errors of numbers: of float32 over decades."""

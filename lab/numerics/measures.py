@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import pointsplat_ns as ps
-from lab.numerics import classic_splatting
 from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
@@ -101,10 +100,10 @@ def _rasterizer(sweep: Sweep, case: Case, given: Case, dtype: torch.dtype, compi
     if sweep.input_precision:
         wanted = picture(case, "reference", torch.float64)
     yield "rounded input", *errors(truth, picture(case, "reference", torch.float64)), doubt
-    arithmetic = torch.float64 if dtype == torch.float64 else torch.float32
-    for what in ("eager", "compiled", "classic") if compiled else ("eager", "classic"):
-        handed = dtype if what == "eager" else arithmetic  # the fast path takes half precision as it is
-        yield what, *errors(picture(given, what, handed), wanted), doubt
+    yield "eager", *errors(picture(given, "eager", dtype), wanted), doubt  # it takes half precision as it is
+    if compiled:
+        arithmetic = torch.float64 if dtype == torch.float64 else torch.float32
+        yield "compiled", *errors(picture(given, "compiled", arithmetic), wanted), doubt
 
 
 def picture(case: Case, what: str, dtype: torch.dtype) -> Picture:
@@ -112,7 +111,7 @@ def picture(case: Case, what: str, dtype: torch.dtype) -> Picture:
 
     Args:
         case: what to draw.
-        what: ``reference``, ``eager``, ``compiled`` or ``classic``.
+        what: ``reference``, ``eager`` or ``compiled``.
         dtype: of the tensors handed over.
     """
     leaves = {name: getattr(case, name).to(dtype, copy=True).requires_grad_() for name in PARAMETERS}
@@ -121,10 +120,6 @@ def picture(case: Case, what: str, dtype: torch.dtype) -> Picture:
     if what == "reference":
         image, alpha, depth = rasterize_reference(
             *leaves.values(), view, K, WIDTH, HEIGHT, case.near, math.inf, sh_degree=3, antialiased=case.antialiased
-        )
-    elif what == "classic":
-        image, alpha, depth = classic_splatting.draw(
-            *leaves.values(), view, K, WIDTH, HEIGHT, case.near, case.antialiased
         )
     else:
         renders, alphas, _ = rasterization(

@@ -22,8 +22,8 @@ DRAWN = (1e-9, 10.0)
 Curve = tuple[str, str]
 """What is measured, and the quantity."""
 
-RASTERIZERS = {"eager": "ours", "compiled": "compiled", "classic": "gsplat's formulas", "rounded input": "input"}
-COLOURS = {"eager": "tab:blue", "compiled": "tab:cyan", "classic": "tab:red", "rounded input": "0.6"}
+RASTERIZERS = {"eager": "ours", "compiled": "compiled", "rounded input": "input"}
+COLOURS = {"eager": "tab:blue", "compiled": "tab:cyan", "rounded input": "0.6"}
 OTHERS: dict[Curve, str] = {
     ("merge", "cost"): "merge: cost of a pair",
     ("merge", "pairs"): "merge: share of pairs chosen",

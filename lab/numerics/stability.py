@@ -3,8 +3,7 @@
     OMP_NUM_THREADS=1 python -m lab.numerics.stability --output outputs/stability
 
 Small scenes are driven to extremes of one property each (:mod:`lab.numerics.cases`), and the errors that this makes are
-measured (:mod:`lab.numerics.measures`), beside the formulas of gsplat as they are published
-(:mod:`lab.numerics.classic_splatting`). What is compared has the same input, rounded to float32 first: the error is
+measured (:mod:`lab.numerics.measures`). What is compared has the same input, rounded to float32 first: the error is
 that of the arithmetic. The truth of images and gradients is the package's per-pixel reference in float64.
 """
 

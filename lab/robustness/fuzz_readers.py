@@ -69,12 +69,6 @@ def at(
     return make
 
 
-def reader(make: Make) -> Make:
-    """Enter a reader under the name of its function."""
-    READERS[make.__name__.replace("_", "-")] = make
-    return make
-
-
 def _scene(path: Path) -> Gaussians:
     scene = read_scene(path)
     if not bool(scene.usable().all()):
@@ -179,8 +173,7 @@ def _with_zeros(header: bytes) -> bytes:
     return _safetensors(header, max(numbers, 0) if isinstance(numbers, int) else 0)
 
 
-@reader
-def refiner_metadata(folder: Path) -> Read:
+def _refiner_metadata(folder: Path) -> Read:
     """The metadata of a refiner's safetensors file, whose tensors are as they should be."""
     from pointsplat_ns.compression.trained_refiner import load_refiner
     from pointsplat_ns.refiner import Refiner, RefinerConfig
@@ -303,6 +296,7 @@ def _use_replica(path: Path) -> object:
 
 
 READERS |= {
+    "refiner-metadata": _refiner_metadata,
     "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
     "pruned-scene": at("a.safetensors", "pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes:read_pruned"),
     "config": at("config.yml", _use_run, _run),

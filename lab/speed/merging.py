@@ -15,13 +15,14 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import torch
 import tyro
 
 from lab.common.printing import console, number, start, table
-from lab.common.results import Row, write_json
+from lab.common.results import write_json
 from lab.common.scenes import KEEP, room
-from lab.common.timing import now, peak_extra_bytes, seconds_of, timed, use_cpu_time
+from lab.common.timing import seconds_of, timed, use_cpu_time
 from lab.common.ways import count_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
@@ -64,21 +65,13 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     return parts
 
 
-def measured(scene: Gaussians, repeats: int, budget: float) -> tuple[list[Row], Row]:
-    """Seconds of each part, and of the whole with its peak memory."""
+def measured(scene: Gaussians, repeats: int, budget: float) -> pd.DataFrame:
+    """Seconds of each part, by kernels and in torch."""
     functions = {}
     for name, part in parts_of(scene).items():
-        for compiled in (True, False):
-            key = f"{name}/{compiled}"
-            functions[key] = lambda key=key, part=part, on=compiled: {key: seconds_of(lambda: part(on))}
-    seconds = timed(functions, repeats, budget)
-    names = dict.fromkeys(key.rpartition("/")[0] for key in seconds)
-    rows: list[Row] = [
-        {"part": name, "seconds": seconds[f"{name}/True"], "seconds_torch": seconds[f"{name}/False"]} for name in names
-    ]
-    begin = now()
-    peak = peak_extra_bytes(lambda: merge(scene, count_of(KEEP, len(scene))), torch.device("cpu"))
-    return rows, {"seconds": now() - begin, "peak_bytes": peak}
+        for way, compiled in (("kernels", True), ("torch", False)):
+            functions[name, way] = lambda key=(name, way), part=part, on=compiled: {key: seconds_of(lambda: part(on))}
+    return pd.Series(timed(functions, repeats, budget)).unstack(sort=False)
 
 
 @torch.no_grad()
@@ -101,23 +94,17 @@ def main(
     use_cpu_time()
     torch.set_num_threads(1)
     dense = room(gaussians) if scene is None else read_scene(scene)
-    rows, whole = measured(dense, repeats, budget)
-    n = len(dense)
-    write_json(json_path, {"gaussians": n, "sh_degree": dense.sh_degree, "parts": rows, "whole": whole})
+    seconds, n = measured(dense, repeats, budget), len(dense)
+    whole = seconds_of(lambda: merge(dense, count_of(KEEP, n)))
+    figures = {"gaussians": n, "sh_degree": dense.sh_degree, "parts": seconds.to_dict("index"), "whole": whole}
+    write_json(json_path, figures)
     lines = [
-        [
-            row["part"],
-            *(number(2, 1e6 / n)(row[key]) for key in ("seconds", "seconds_torch")),
-            number(1)(row["seconds_torch"] / row["seconds"]),
-        ]
-        for row in rows
+        (name, *map(number(2, 1e6 / n), (row.kernels, row.torch)), number(1)(row.torch / row.kernels))
+        for name, row in seconds.iterrows()
     ]
     heads = ("part", "kernels, us a Gaussian", "torch, us a Gaussian", "ratio")
     console().print(table(f"merging {n:,} Gaussians, the first round, CPU time of one thread", heads, lines))
-    memory = (
-        "" if whole["peak_bytes"] is None else f", {whole['peak_bytes'] / n:,.0f} bytes a Gaussian beyond the scene"
-    )
-    print(f"whole, to {KEEP:.0%}: {whole['seconds']:.1f} CPU s{memory}")
+    print(f"whole, to {KEEP:.0%}: {whole:.1f} CPU s")
 
 
 if __name__ == "__main__":

@@ -1,31 +1,28 @@
-"""Where a step of a training goes, and what its parts save beside those that nerfstudio configures.
+"""Where a step of a training goes, and what compiled kernels save.
 
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --downscale 1 2
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --refiner
 
 Steps of ``splatfacto-cpu`` go on from the end of a finished training whose photos are at hand, at its number of
-Gaussians. They alternate between ours, ours without compiled kernels, and one with nerfstudio's Adam and
-pytorch-msssim's SSIM besides, so that a busy moment hits all. Those of a refiner begin with a new network on that
-scene, and alternate between ours and ours without compiled kernels. CPU seconds of one thread are counted, and nothing
-is saved.
+Gaussians; those of a refiner begin with a new network on that scene. They alternate between ours and ours without
+compiled kernels, so that a busy moment hits both. CPU seconds of one thread are counted, and nothing is saved.
 """
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 import tyro
-from pytorch_msssim import SSIM
 from torch.profiler import ProfilerActivity, profile
 
 import pointsplat_ns as ps
-from lab.common.printing import start
+from lab.common.printing import markdown, percent, start
 from pointsplat_ns.io import open_run
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import dataparser_of
@@ -49,12 +46,6 @@ NETWORK = {
 """And those of a refiner."""
 
 ADAM = {"Adam": ("Optimizer.step#Adam.step",)}
-
-KINDS = {
-    "ours": "ours",
-    "torch": "drawn by torch, without a compiler",
-    "theirs": "with nerfstudio's Adam and SSIM as well",
-}
 
 WARM_UP = 2
 """Steps that are not counted."""
@@ -85,59 +76,23 @@ def _started(config: Any, data: Path | None, folder: Path) -> Any:
     return trainer
 
 
-def _table(trainer: Any, count: int) -> None:
-    model, ours = trainer.pipeline.model, trainer.pipeline.model.ssim
-    theirs = SSIM(data_range=1.0, size_average=True, channel=3).forward  # a module would be a part of the model
-
-    def prepare(kind: str) -> None:
-        model.ssim, model.config.compiled = theirs if kind == "theirs" else ours, None if kind == "ours" else False
-        for optimizer in trainer.optimizers.optimizers.values():
-            for group in optimizer.param_groups:
-                group["fused"] = kind != "theirs"
-
-    lines = _measured(trainer, prepare, tuple(KINDS), trainer.config.max_num_iterations, count, DRAWING | ADAM)
-    height, width = model.last_size
-    print(f"{width} x {height}, {len(model.means):,} Gaussians, CPU seconds a step:", *lines, sep="\n", flush=True)
-
-
-def _refiners_table(trainer: Any, count: int) -> None:
-    pipeline = trainer.pipeline
-    pipeline.train()
-
-    def prepare(kind: str) -> None:
-        pipeline.model.config.compiled = None if kind == "ours" else False
-
-    lines = _measured(trainer, prepare, ("ours", "torch"), 0, count, DRAWING | NETWORK | ADAM)
-    kept, size = len(pipeline.model.pruned_scene(0).pruned), pipeline.model.config.size
-    print(f"{size} network, {kept:,} Gaussians, CPU seconds a step:", *lines, sep="\n", flush=True)
-
-
-def _measured(
-    trainer: Any,
-    prepare: Callable[[str], None],
-    kinds: tuple[str, ...],
-    step: int,
-    count: int,
-    parts: dict[str, tuple[str, ...]],
-) -> list[str]:
-    """Rows of a table: seconds of a step of each kind, and shares of the parts of one of ours.
+def _measured(trainer: Any, step: int, count: int, parts: dict[str, tuple[str, ...]]) -> str:
+    """Seconds of a step with and without compiled kernels, and shares of the parts of one with them, as a table.
 
     Args:
         trainer: whose steps are taken.
-        prepare: called with the kind of the next step.
-        kinds: ours first.
         step: number of the first step.
         count: number of steps counted of each kind.
         parts: events of torch's profiler by part.
     """
+    kinds = {"ours": None, "drawn by torch, without a compiler": False}
     seconds: dict[str, list[float]] = {kind: [] for kind in kinds}
+    steps = itertools.count(step)
 
     def take(kind: str) -> float:
-        nonlocal step
-        prepare(kind)
+        trainer.pipeline.model.config.compiled = kinds[kind]
         start = time.process_time()
-        trainer.train_iteration(step)
-        step += 1
+        trainer.train_iteration(next(steps))
         return time.process_time() - start
 
     for number in range(WARM_UP + count):
@@ -151,11 +106,12 @@ def _measured(
             take("ours")
         total = time.perf_counter() - start
     spent_in = {event.key: event.cpu_time_total / 1e6 for event in found.key_averages()}
-    ours = median(seconds["ours"])
-    lines = [f"| {KINDS[kind]} | {median(taken):.3f} | {median(taken) / ours:.2f} |" for kind, taken in seconds.items()]
     shares = {part: sum(spent_in.get(event, 0.0) for event in events) / total for part, events in parts.items()}
     shares["the rest"] = 1 - sum(shares.values())
-    return lines + [f"| {part} | {100 * share:.0f} % |" for part, share in shares.items()]
+    ours = median(seconds["ours"])
+    lines = [[kind, f"{median(taken):.3f}", f"{median(taken) / ours:.2f}"] for kind, taken in seconds.items()]
+    lines += [[part, percent(round(share, 2)), ""] for part, share in shares.items()]
+    return markdown(["a step", "CPU s, or share", "ratio"], lines)
 
 
 def main(
@@ -172,12 +128,18 @@ def main(
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         if refiner:
-            _refiners_table(_started(pointsplat_config(), run, Path(folder)), count)
+            trainer = _started(pointsplat_config(), run, Path(folder))
+            model = trainer.pipeline.train().model
+            text = _measured(trainer, 0, count, DRAWING | NETWORK | ADAM)
+            print(f"{model.config.size} network, {len(model.pruned_scene(0).pruned):,} Gaussians:\n\n{text}")
             return
         trainer = _trainer(run, Path(folder))
+        model = trainer.pipeline.model
         for factor in downscale:
-            trainer.pipeline.model._get_downscale_factor = lambda factor=factor: factor
-            _table(trainer, count)
+            model._get_downscale_factor = lambda factor=factor: factor
+            text = _measured(trainer, trainer.config.max_num_iterations, count, DRAWING | ADAM)
+            height, width = model.last_size
+            print(f"{width} x {height}, {len(model.means):,} Gaussians:\n\n{text}\n", flush=True)
 
 
 if __name__ == "__main__":

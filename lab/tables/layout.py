@@ -1,24 +1,39 @@
-"""Arranges means as the paper's tables: rows of text, and writes them as Markdown and as LaTeX."""
+"""All cells of a folder, arranged as the paper's tables, in Markdown and in LaTeX."""
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from lab.tables.means import Group, Mean
+import pandas as pd
+
+from lab.common.printing import markdown, number, percent
+from lab.common.results import Row
+from lab.tables.cells import FILES, Tables
+from lab.tables.figure import medians, plot_figure
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
-from pointsplat_ns.io.files import three_digits
-from pointsplat_ns.tradeoff.points import ImageMetrics
+from pointsplat_ns.io.files import replacing, three_digits
 
-NO_FIGURE = "-"
-"""Text of an empty cell."""
+READING = (
+    "Figures are means over the same scenes in all rows of a table, but for rows with a mark. PSNR (dB), SSIM and "
+    'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s own renders in the '
+    'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, with its PSNR and the '
+    "difference; among dense scenes it is the one of the least PSNR. \\*: nothing is fine-tuned or refined. Frames a "
+    "second compare on an idle machine alone."
+)
 
 OTHER_SCENES = "†"
 """Mark of a row whose means are over other scenes than those of the table."""
 
-Row = tuple[str, ...]
+WRITTEN = {"psnr": number(2), "ssim": number(3), "lpips": number(3)}
+"""How metrics are written."""
+
+Cell = tuple[Way, float]
+"""A way, and the share of the Gaussians kept."""
 
 
 @dataclass(frozen=True)
@@ -27,247 +42,225 @@ class Table:
 
     number: int
     title: str
-    header: Row
-    sections: tuple[tuple[Row, ...], ...]
-    """Rows, in sections with a line between them."""
-    notes: tuple[str, ...] = ()
-    """Lines below the table: missing cells, and the reasons."""
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    notes: list[str]
+    """Lines below the table: what rows were made with, missing cells, and the reasons."""
 
 
 class Layout:
-    """Makes the tables of a group. ``shares`` are those in Tables 1 and 2, to which the shares of measured cells are
-    added; ``missing`` has the reasons for missing cells, by key."""
+    """Makes the tables of a group of scenes. ``keeps`` are the shares of Tables 1 and 2, to which those of measured
+    cells are added."""
 
-    def __init__(self, group: Group, shares: Sequence[float], missing: Mapping[str, str]):
-        self.group, self.missing = group, missing
-        names = {way.name for way in WAYS.table_1} - {way.name for way in WAYS.table_4}  # Table 4 has other shares
-        measured = {share for scene in group.scenes for way, share in scene.cells if way in names}
-        self.shares = sorted({*shares, *measured}, reverse=True)
+    def __init__(self, tables: Tables, group: str, names: Sequence[str], keeps: Sequence[float]):
+        self.all, self.group, self.names = tables, group, names
+        self.cells = {key: cell for key, cell in tables.cells.items() if key.split("/")[0] in names}
+        of_table_1 = {way.name for way in WAYS.table_1} - {way.name for way in WAYS.table_4}  # Table 4 has other shares
+        measured = {cell["point"]["share"] for cell in self.cells.values() if cell["way"] in of_table_1}
+        self.shares = sorted({*keeps, *measured}, reverse=True)
+        self.frame = pd.DataFrame([_flat(key, cell) for key, cell in self.cells.items()])
+        self.frame = self.frame.set_index(["way", "share", "scene"]).sort_index()
+        dense = self.frame["photos_psnr"].xs(("dense", 1.0)) if ("dense", 1.0) in self.frame.index else pd.Series()
+        self.frame["lost"] = self.frame.index.get_level_values("scene").map(dense) - self.frame["photos_psnr"]
+        self.has_photos = bool(self.frame["photos_psnr"].notna().any())
 
     def tables(self) -> list[Table]:
-        """Tables 1 to 4."""
-        return [self._table_1(), self._table_2(), self._table_3(), self._table_4()]
-
-    def _table_1(self) -> Table:
-        blocks = [[(WAYS.dense, 1.0)], *([(way, share) for way in WAYS.table_1] for share in self.shares)]
-        sections = [[((_percent(share), way.label), way, share) for way, share in block] for block in blocks]
-        return self._of_quality(1, "What is left at a number of Gaussians", ("kept", "method"), sections)
-
-    def _table_2(self) -> Table:
-        header = ("kept", "method", "Gaussians", "frames a second", "MB", "scenes")
-        ways = WAYS.table_2
-        blocks = [[(WAYS.dense, 1.0)], *([(way, share) for way in ways] for share in self.shares)]
-        cells = [pair for block in blocks for pair in block]
-        over = self._shared(cells)
-        sections = []
-        for block in blocks:
-            rows = []
-            for way, share in block:
-                mean = self.group.mean(way.name, share, over)
-                figures: Row = ("not measured", NO_FIGURE, NO_FIGURE, NO_FIGURE)
-                if mean is not None:
-                    figures = (
-                        f"{mean.gaussians:,.0f}",
-                        _fps(mean.fps),
-                        three_digits(mean.megabytes),
-                        _scenes(mean),
-                    )
-                rows.append((_percent(share), way.label, *figures))
-            sections.append(tuple(rows))
-        return Table(2, self._title("Efficiency", over), header, tuple(sections), self._notes(cells, over))
-
-    def _table_3(self) -> Table:
-        rows = [((f"{weight:g}", way.label), way, PROTOCOL.ablation_share) for weight, way in WAYS.table_3]
-        sections = [rows[i : i + 2] for i in range(0, len(rows), 2)]
-        title = f"Lambda of the paper's score, {_percent(PROTOCOL.ablation_share)} kept"
-        return self._of_quality(3, title, ("lambda", "method"), sections)
-
-    def _table_4(self) -> Table:
+        """Tables 1 to 4, and the medians of Figure 4 where it has any."""
+        every = [(WAYS.dense, 1.0), *((way, share) for share in self.shares for way in WAYS.table_1)]
+        few = [(way, share) for way, share in every if way == WAYS.dense or way in WAYS.table_2]
+        share = PROTOCOL.ablation_share
+        lambdas = [((f"{weight:g}", way.label), way, share) for weight, way in WAYS.table_3]
         branches = (("", "", ""), ("yes", "", ""), ("yes", "", "yes"), ("yes", "yes", ""), ("yes", "yes", "yes"))
-        rows = [
-            ((number, *used), way, PROTOCOL.ablation_share)
-            for number, used, way in zip(("I", "II", "III", "IV", "V"), branches, WAYS.table_4, strict=True)
+        models = zip(("I", "II", "III", "IV", "V"), branches, WAYS.table_4, strict=True)
+        parts = [((name, *used), way, share) for name, used, way in models]
+        first = ("kept", "method")
+        return [
+            self._quality(1, "What is left at a number of Gaussians", first, list(map(_named, every))),
+            self._efficiency(first, list(map(_named, few))),
+            self._quality(3, f"Lambda of the paper's score, {percent(share)} kept", ("lambda", "method"), lambdas),
+            self._quality(
+                4,
+                f"The dual-branch encoder, {percent(share)} kept",
+                ("model", "geometry", "appearance", "position"),
+                parts,
+            ),
+            *self._medians(),
         ]
-        first = ("model", "geometry", "appearance", "position")
-        return self._of_quality(4, f"The dual-branch encoder, {_percent(PROTOCOL.ablation_share)} kept", first, [rows])
 
-    def _of_quality(
-        self, number: int, title: str, first: Row, sections: Sequence[Sequence[tuple[Row, Way, float]]]
-    ) -> Table:
-        """A table of PSNR, SSIM and LPIPS, with the paper's PSNR and SSIM where dataset and protocol are the paper's.
-        Its LPIPS is by another network."""
-        cells = [(way, share) for section in sections for _, way, share in section]
-        over = self._shared(cells)
-        dataset = self.group.comparable_dataset
-        with_paper = any(published(number, dataset, way.name, share) for way, share in cells)
-        metrics = ("PSNR", "SSIM", "LPIPS")
-        header = first
-        header += metrics if self.group.has_photos else ()
-        header += tuple(f"{name} (renders)" for name in metrics)
-        header += ("loses most", "scenes")
-        header += tuple(f"{name} (paper)" for name in metrics[:2]) if with_paper else ()
+    def _quality(self, which: int, title: str, first: tuple[str, ...], rows: list[tuple]) -> Table:
+        """A table of PSNR, SSIM, LPIPS, with the paper's PSNR and SSIM where dataset and protocol are the paper's."""
+        dataset, cells = self.all.comparable(self.names), [(way, share) for _, way, share in rows]
+        theirs = {cell: published(which, dataset, cell[0].name, cell[1]) for cell in cells}
+        kinds = (["photos"] if self.has_photos else []) + ["renders"]
+        heads = [name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN]
+        heads += ["loses most", "scenes"] + ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
 
-        def row(words: Row, way: Way, share: float) -> Row:
-            mean = self.group.mean(way.name, share, over)
-            if mean is None:
-                figures: Row = ("not measured",) + (NO_FIGURE,) * (7 if self.group.has_photos else 4)
+        def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
+            found = [_text(write, mean[f"{kind}_{name}"]) for kind in kinds for name, write in WRITTEN.items()]
+            return [*found, _worst(same)]
+
+        def more(cell: Cell) -> list[str]:
+            known = (theirs[cell] or (None, None))[:2]
+            return [_text(write, value) for write, value in zip(WRITTEN.values(), known, strict=False)]
+
+        return self._table(which, title, first, heads, rows, figures, more if any(theirs.values()) else None)
+
+    def _efficiency(self, first: tuple[str, ...], rows: list[tuple]) -> Table:
+        def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
+            frames = (1000 / same["frame_ms"]).mean()
+            return [f"{mean['gaussians']:,.0f}", f"{frames:.3g}", three_digits(mean["bytes"] / 1e6)]
+
+        return self._table(
+            2, "Efficiency", first, ["Gaussians", "frames a second", "MB", "scenes"], rows, figures, None
+        )
+
+    def _table(self, which, title, first, heads, rows, figures, more) -> Table:
+        """A table of rows: their first words, way and share.
+
+        Args:
+            which: number of the table.
+            title: what it is of.
+            first: heads of the first words.
+            heads: heads of what follows.
+            rows: first words, way and share of each.
+            figures: texts of a row's cells, from the cells of its scenes and their means.
+            more: texts of further cells, from way and share; None for none.
+        """
+        scenes = {}
+        for _, way, share in rows:
+            known = (way.name, share) in self.frame.index
+            scenes[way, share] = frozenset(self.frame.loc[way.name, share].index) if known else frozenset()
+        counts = Counter(names for names in scenes.values() if names)
+        over = max(counts, key=lambda names: (counts[names], len(names), sorted(names)), default=frozenset())
+        lines, marked = [], False
+        for words, way, share in rows:
+            names = scenes[way, share]
+            if not names:
+                cells = ["not measured"] + ["-"] * (len(heads) - 1 - 2 * (more is not None))
             else:
-                figures = _quality(mean.photos) if self.group.has_photos else ()
-                figures += (*_quality(mean.renders), _worst(mean), _scenes(mean))
-            theirs = _quality(published(number, dataset, way.name, share))[:2] if with_paper else ()
-            return (*words, *figures, *theirs)
-
-        rows = tuple(tuple(row(*entry) for entry in section) for section in sections)
-        return Table(number, self._title(title, over), header, rows, self._notes(cells, over))
-
-    def _title(self, what: str, over: frozenset[str]) -> str:
-        return f"{what}: {self.group.name}, {_scenes_text(len(over))}"
-
-    def _shared(self, cells: Sequence[tuple[Way, float]]) -> frozenset[str]:
-        return self.group.shared((way.name, share) for way, share in cells)
-
-    def _notes(self, cells: Sequence[tuple[Way, float]], over: frozenset[str]) -> tuple[str, ...]:
-        """Lines below a table: rows of other scenes, the networks and steps of rows, and reasons for empty rows."""
-        means = [self.group.mean(way.name, share, over) for way, share in cells]
+                comparable = over <= names
+                same = self.frame.loc[way.name, share].loc[sorted(over if comparable else names)]
+                marked |= not comparable
+                mean = same.mean(numeric_only=True, skipna=False)
+                cells = [*figures(same, mean), f"{len(same)}" + f" {OTHER_SCENES}" * (not comparable)]
+            lines.append((*words, *cells, *(more((way, share)) if more else ())))
         notes = []
-        if any(mean is not None and not mean.comparable for mean in means):
-            notes.append(
-                f"{OTHER_SCENES}: not over the scenes of the other rows ({', '.join(sorted(over))}); its means do not "
-                "compare with theirs"
-            )
-        return (*notes, *self._tools(cells), *self._reasons(cells))
+        if marked:
+            notes = [f"{OTHER_SCENES}: not over the scenes of the other rows ({', '.join(sorted(over))})"]
+        title = f"{title}: {self.group}, {len(over)} scene{'s' * (len(over) != 1)}"
+        return Table(
+            which, title, (*first, *heads), lines, notes + self._notes([(way, share) for _, way, share in rows])
+        )
 
-    def _tools(self, cells: Sequence[tuple[Way, float]]) -> list[str]:
-        """The networks, and the steps of fine-tuning, that rows were made with."""
-        rows: dict[str, list[str]] = {}
+    def _notes(self, cells: list[Cell]) -> list[str]:
+        """The networks and steps that rows were made with, and reasons for missing cells, each once."""
+        found: dict[str, dict[str, None]] = {}
         for way, share in cells:
-            for scene in self.group.scenes:
-                cell = scene.cells.get((way.name, share))
-                if cell is not None and cell.made_with and (way.network is not None or way.fine_tuned):
-                    row, labels = f"{way.label} ({_percent(share)})", rows.setdefault(cell.made_with, [])
-                    labels += [] if row in labels else [row]
-        return [f"{', '.join(labels)}: {made_with}" for made_with, labels in rows.items()]
+            for name in self.names:
+                key, label = cell_key(name, way, share), f"{way.label} ({percent(share)})"
+                if key not in self.cells:
+                    why = f"Not measured, {self.all.missing.get(key, 'not yet')}"
+                    found.setdefault(why, {})[label if len(self.names) == 1 else f"{label} on {name}"] = None
+                elif (with_what := self.cells[key]["made_with"]) and (way.network is not None or way.fine_tuned):
+                    found.setdefault(f"Made with {with_what}", {})[label] = None
+        return [f"{why}: {', '.join(labels)}" for why, labels in found.items()]
 
-    def _reasons(self, cells: Sequence[tuple[Way, float]]) -> tuple[str, ...]:
-        """Reasons for empty rows and missing scenes, each once."""
-        rows: dict[str, dict[str, list[str]]] = {}
-        for way, share in cells:
-            for scene in self.group.scenes:
-                if (way.name, share) not in scene.cells:
-                    why = self.missing.get(cell_key(scene.about.name, way, share), "not yet")
-                    names = rows.setdefault(why, {}).setdefault(way.label, [])
-                    names += [] if scene.about.name in names else [scene.about.name]
-        everywhere, notes = len(self.group.scenes), []
-        for why, by_label in rows.items():
-            labels_by_place: dict[str, list[str]] = {}
-            for label, names in by_label.items():
-                place = "" if len(names) == everywhere else f" on {', '.join(names)}"
-                labels_by_place.setdefault(place, []).append(label)
-            notes += [f"Not measured{where}: {'; '.join(labels)}: {why}" for where, labels in labels_by_place.items()]
-        return tuple(notes)
+    def _medians(self) -> list[Table]:
+        found = medians(self.cells, list(self.names))
+        title = f"Medians of Figure 4: {self.group}, {percent(PROTOCOL.figure_share)} kept"
+        rows = [
+            (way.label, f"{found[way.name][0]:.2f}", f"{found[way.name][1]:.1f}")
+            for way, _ in WAYS.figure_4
+            if way.name in found
+        ]
+        return [Table(0, title, ("method", "opacity", "log10 of the volume"), rows, [])] if rows else []
 
 
-def figure_medians(group: Group, medians: Mapping[str, tuple[float, float]]) -> Table:
-    """The medians of Figure 4, of opacity and of log10 of the volume by name of the way, as a table."""
-    rows = tuple(
-        (way.label, f"{medians[way.name][0]:.2f}", f"{medians[way.name][1]:.1f}")
-        for way, _ in WAYS.figure_4
-        if way.name in medians
-    )
-    title = f"Medians of Figure 4: {group.name}, {_percent(PROTOCOL.figure_share)} kept"
-    return Table(0, title, ("method", "opacity", "log10 of the volume"), (rows,))
+def _named(cell: Cell) -> tuple[tuple[str, str], Way, float]:
+    way, share = cell
+    return (percent(share), way.label), way, share
 
 
-def _scenes(mean: Mean) -> str:
-    return f"{mean.scenes}" if mean.comparable else f"{mean.scenes} {OTHER_SCENES}"
+def _flat(key: str, cell: Row) -> Row:
+    """A cell's figures in one level."""
+    point = cell["point"]
+    row = {"scene": key.split("/")[0], "way": cell["way"], **{n: point[n] for n in ("share", "gaussians", "bytes")}}
+    for kind, target in (("renders", "against_dense"), ("photos", "against_photos")):
+        found = point[target] or {}
+        row |= {f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v for name in WRITTEN}
+    return row | {"frame_ms": point["frame_ms"]}
 
 
-def _scenes_text(count: int) -> str:
-    return f"{count} scene{'s' if count != 1 else ''}"
+def _text(write: Any, value: float | None) -> str:
+    return "-" if value is None or pd.isna(value) else write(value)
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:g} %"
+def _worst(same: pd.DataFrame) -> str:
+    """The scene that loses most, or that has the least PSNR where that is not known; with its PSNR and the loss."""
+    psnr = same["photos_psnr"].fillna(same["renders_psnr"])
+    if psnr.isna().any():
+        return "-"
+    order = pd.DataFrame({"lost": same["lost"].fillna(-psnr), "low": -psnr}).sort_values(["lost", "low"])
+    name, lost = order.index[-1], same["lost"][order.index[-1]]
+    return f"{name} {psnr[name]:.2f}" + (f" ({-lost:+.2f})" if lost and not pd.isna(lost) else "")
 
 
-def _quality(quality: ImageMetrics | None) -> Row:
-    if quality is None:
-        return (NO_FIGURE,) * 3
-    psnr = NO_FIGURE if math.isinf(quality.psnr) else f"{quality.psnr:.2f}"
-    return psnr, f"{quality.ssim:.3f}", NO_FIGURE if quality.lpips is None else f"{quality.lpips:.3f}"
-
-
-def _worst(mean: Mean) -> str:
-    if math.isinf(mean.worst_psnr):
-        return NO_FIGURE
-    lost = "" if mean.worst_loss is None or mean.worst_loss == 0 else f" ({-mean.worst_loss:+.2f})"
-    return f"{mean.worst} {mean.worst_psnr:.2f}{lost}"
-
-
-def _fps(value: float | None) -> str:
-    if value is None:
-        return "busy"
-    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
-
-
-def markdown_text(text: str) -> str:
-    """Text with Markdown's special characters escaped.
+def escaped(text: str) -> str:
+    """Text with Markdown's special characters escaped, in one line.
 
     Example:
-        >>> print(markdown_text("PointSplat* of room_1"))
+        >>> print(escaped("PointSplat* of room_1"))
         PointSplat\\* of room\\_1
     """
     return re.sub(r"([\\`*_{}\[\]<>#|~])", r"\\\1", " ".join(text.split()))
 
 
-def latex_text(text: str) -> str:
-    """Text with LaTeX's special characters escaped.
-
-    Example:
-        >>> print(latex_text("50 % of room_1"))
-        50 \\% of room\\_1
-    """
-    escaped = {
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        OTHER_SCENES: r"\textdagger{}",
-    }
-    escaped |= {character: f"\\{character}" for character in "&%$#_{}"}
-    return "".join(escaped.get(character, character) for character in " ".join(text.split()))
-
-
 def markdown_table(table: Table) -> str:
     """A table in Markdown, with its title above and its notes below."""
     name = f"Table {table.number}. " if table.number else ""
-    lines = [f"**{name}{markdown_text(table.title)}**", ""]
-    lines += [_line(table.header), "|" + "---|" * len(table.header)]
-    lines += [_line(row) for section in table.sections for row in section]
-    lines += ["", *(f"- {markdown_text(note)}" for note in table.notes)] if table.notes else []
-    return "\n".join(lines) + "\n"
-
-
-def _line(row: Row) -> str:
-    return "| " + " | ".join(markdown_text(text) for text in row) + " |"
+    header, *rows = (list(map(escaped, row)) for row in (table.header, *table.rows))
+    notes = "\n".join(f"- {escaped(note)}" for note in table.notes)
+    return "\n\n".join([f"**{name}{escaped(table.title)}**", markdown(header, rows), *([notes] if notes else [])])
 
 
 def latex_table(table: Table) -> str:
-    """A table in LaTeX with the package ``booktabs``; the notes are comments."""
-    columns = "".join("l" if i < 2 else "r" for i in range(len(table.header)))
-    name = f"% Table {table.number} of the paper" if table.number else "%"
-    lines = [name, r"\begin{table*}", r"\centering", rf"\caption{{{latex_text(table.title)}}}"]
-    lines += [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", _latex_line(table.header)]
-    for section in table.sections:
-        lines += [r"\midrule", *map(_latex_line, section)]
-    lines += [r"\bottomrule", r"\end{tabular}", *(f"% {' '.join(note.split())}" for note in table.notes)]
-    return "\n".join([*lines, r"\end{table*}"]) + "\n"
+    """A table in LaTeX with the package ``booktabs``; title and notes are comments."""
+    frame = pd.DataFrame([[" ".join(text.split()) for text in row] for row in table.rows], columns=list(table.header))
+    about = [f"% {' '.join(text.split())}" for text in (f"Table {table.number}. {table.title}", *table.notes)]
+    return "\n".join([*about, frame.to_latex(index=False, escape=True)])
 
 
-def _latex_line(row: Row) -> str:
-    return " & ".join(latex_text(text) for text in row) + r" \\"
+def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
+    """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows without
+    measurements."""
+    if not tables.cells:
+        return
+    tables.save(folder)
+    groups = tables.groups()
+    made = {group: Layout(tables, group, names, keeps).tables() for group, names in groups.items()}
+    with replacing(folder / FILES[1], named=False) as part:
+        part.write_text(_markdown(tables, made), encoding="utf-8")
+    with replacing(folder / FILES[2], named=False) as part:
+        every = [latex_table(table) for members in made.values() for table in members]
+        part.write_text("\n".join([r"% needs \usepackage{booktabs}", *every]), encoding="utf-8")
+    plot_figure(tables.cells, groups, folder / FILES[3])
 
 
-def latex_document(tables: Sequence[Table], about: Sequence[str]) -> str:
-    """All tables, for ``\\input``, with lines of text as comments at the beginning."""
-    head = [f"% {' '.join(line.split())}" for line in about]
-    return "\n".join([*head, r"% needs \usepackage{booktabs}", "", *map(latex_table, tables)])
+def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
+    machines = sorted({tables.scenes[key.split("/")[0]]["machine"] for key in tables.cells})
+    made = sorted({f"{cell['version']}, commit {cell['commit'] or 'unknown'}" for cell in tables.cells.values()})
+    parts = [READING, escaped(f"Measured on {'; '.join(machines)}, by pointsplat_ns {'; '.join(made)}.")]
+    for group, names in tables.groups().items():
+        heads, lines = ["scene", "Gaussians", "judged in", "size", "differs from the paper in"], []
+        for about in map(tables.scenes.__getitem__, names):
+            dense = tables.cells.get(cell_key(about["name"], WAYS.dense, 1.0))
+            count = f"{dense['point']['gaussians']:,}" if dense else "-"
+            size = f"{about['width']} x {about['height']}"
+            line = (about["name"], count, f"{about['views']} {about['origin']}", size, about.get("differs", ""))
+            lines.append(list(map(escaped, line)))
+        if tables.dataset(names) and tables.comparable(names):
+            parts_of_paper = "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS is by VGG."
+            parts.append(parts_of_paper)
+        parts += [f"## {escaped(group)}", markdown(heads, lines), *map(markdown_table, made_tables[group])]
+    parts += [f"![Figure 4]({FILES[3]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
+    return "\n\n".join(part.strip() for part in parts) + "\n"

@@ -1,45 +1,43 @@
-"""Makes the scene of a cell: by this package, by weights that are found by their metadata, or by splat-transform, a
-Node package and the peer of merging. Tells its tools, or the reason why it cannot be made."""
+"""Makes the scene of a cell: by this package, by weights that are found by their metadata, or by splat-transform, the
+peer of merging. Tells its tools, or the reason why it cannot be made."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-import re
-import shlex
-import shutil
-import subprocess
+import random
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from lab.tables.scene import OpenedScene, TableOptions
+import pointsplat_ns as ps
+from lab.common.ways import SplatTransform
+from lab.tables.scenes import OpenedScene, Options
 from lab.tables.ways import PROTOCOL, WAYS, Network, Way
-from pointsplat_ns.compression.fine_tune import fine_tune
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner import read_metadata
-from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
-from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.measuring import MadeScene, make
-from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting
 
 
 class Tools:
     """The tools of cells besides the package: weights, and splat-transform, by default that on PATH, when first
     needed."""
 
-    def __init__(self, options: TableOptions, refiners: Refiners, program: str | None = None):
+    def __init__(self, options: Options, refiners: Refiners, program: str | None = None):
         self.options, self.refiners, self.program = options, refiners, program
 
     @functools.cached_property
@@ -86,62 +84,58 @@ class Maker:
     def __init__(self, scene: OpenedScene, name: str, tools: Tools):
         self.scene, self.name, self.tools = scene, name, tools
         self._scores: dict[tuple[str, float | None], tuple[Tensor, float]] = {}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
-    def close(self) -> None:
-        """Remove files for other programs."""
-        if self._folder is not None:
-            self._folder.cleanup()
-
-    def make(self, way: Way, share: float, progress: Progress) -> MadeScene:
-        """The scene of a measurable cell, and the cost of making it. The time includes scores that other cells share.
+    def make(self, way: Way, share: float) -> tuple[Gaussians, float]:
+        """The scene of a measurable cell, and the seconds of making it, with those of scores that other cells share.
         Raises ProgramFailed if another program fails, SceneError if its result cannot be read or the SH degree exceeds
         the refiner's, and DataError if there are no views."""
-        dense = self.scene.dense
-        if way.name == DENSE:
-            return MadeScene(dense, 0.0, None)
-        count = resolve_keep(len(dense), share, dense.sh_degree)
+        dense, start = self.scene.dense, time.perf_counter()
+        if way == WAYS.dense:
+            return dense, 0.0
+        count, path, data = resolve_keep(len(dense), share, dense.sh_degree), self.scene.path, self.scene.data
         if way.mode is not None:
-            scene, usage = self.tools.peer.modes[way.mode].reduce(self._ply(), count, timeout=7200.0)
-            return MadeScene(scene.to(dense.device), usage.seconds, usage.peak_bytes)
+            with tempfile.TemporaryDirectory() as folder:
+                write_ply(dense, Path(folder) / "dense.ply")
+                scene, usage = self.tools.peer.modes[way.mode].reduce(Path(folder) / "dense.ply", count, timeout=7200.0)
+            return scene.to(dense.device), usage.seconds
+        if way.repaired:
+            return ps.compact(path, count, data=data).scene, time.perf_counter() - start
         if method_named(way.by).score is None:
-            return make(dense, Setting(count, dense.sh_degree, way.repair, way.by), self.scene.new_views, progress)
-        assert way.repair not in EFFORTS, "repairs are of merged scenes"
-        scores, before = self._scored(way, functools.partial(progress, "scoring"))
+            return ps.prune(path, count, way.by, data=data), time.perf_counter() - start
+        scores, before = self._scored(way)
         start = time.perf_counter()
         scene = dense[select(scores, count)]
         if way.network is not None:
             scene = self.tools.weights(way.network, share, self.name).refiner(scene)
         if way.fine_tuned:
-            scene = self._tuned(scene, functools.partial(progress, "fine-tuning"))
-        return MadeScene(scene, before + time.perf_counter() - start, None)
+            scene = fine_tuned(scene, dense, self.scene, self.tools.options.fine_tune)
+        return scene, before + time.perf_counter() - start
 
-    def _scored(self, way: Way, progress: functools.partial[None]) -> tuple[Tensor, float]:
+    def _scored(self, way: Way) -> tuple[Tensor, float]:
         """Scores (N,), and the seconds of computing them."""
         key = way.by, way.opacity_weight
         if key not in self._scores:
             method, start = method_named(way.by), time.perf_counter()
-            views = None
-            if method.needs_views:
-                views = self.scene.training.views.spread(self.tools.options.scoring_views)
-            scores = score_of(self.scene.dense, method, views, way.opacity_weight, progress)
+            views = self.scene.training.views.spread(self.tools.options.scoring_views) if method.needs_views else None
+            scores = score_of(self.scene.dense, method, views, way.opacity_weight)
             self._scores[key] = scores, time.perf_counter() - start
         return self._scores[key]
 
-    def _tuned(self, scene: Gaussians, progress: functools.partial[None]) -> Gaussians:
-        """The scene optimised against training photos, or the dense scene's renders where there are no photos."""
-        training = self.scene.training
-        targets = self.scene.dense if training.photos is None else training.photos
-        return fine_tune(
-            scene, training.views, targets, self.tools.options.fine_tune, seed=PROTOCOL.seed, progress=progress
-        )
 
-    def _ply(self) -> Path:
-        """The dense scene as a PLY for other programs."""
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory()
-            write_ply(self.scene.dense, Path(self._folder.name) / "dense.ply")
-        return Path(self._folder.name) / "dense.ply"
+def fine_tuned(small: Gaussians, dense: Gaussians, scene: OpenedScene, steps: int) -> Gaussians:
+    """The recovery step of the baselines: steps of Adam on 0.8 L1 + 0.2 (1 - SSIM) against training photos, or renders
+    of the dense scene where there are no photos. Each view comes once before any is repeated."""
+
+    def examples() -> Iterator[Example]:
+        (views, photos), order = (scene.training.views, scene.training.photos), random.Random(PROTOCOL.seed)
+        with torch.no_grad():
+            targets = photos or [render(dense, view) for view in views]
+        while True:
+            for index in reversed(order.sample(range(len(views)), len(views))):
+                yield Example(views[index], targets[index].to(small.means))
+
+    scenes = optimised(small, Adam(small, AdamSettings(), RATES), examples())
+    return next(itertools.islice(scenes, steps - 1, None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,68 +224,3 @@ def _names(scenes: Any) -> frozenset[str]:
     """Names of scenes from metadata: a list, or text with commas."""
     words = scenes.split(",") if isinstance(scenes, str) else scenes if isinstance(scenes, list) else []
     return frozenset(str(word).strip() for word in words if str(word).strip())
-
-
-@dataclass(frozen=True)
-class Reducer:
-    """A program that reads a PLY and writes a smaller one."""
-
-    label: str
-    command: Callable[[Path, int, Path], list[str]]
-    """The command line for a PLY to read, a number of Gaussians, and a PLY to write."""
-
-    def reduce(self, source: Path, count: int, timeout: float | None = None) -> tuple[Gaussians, Usage]:
-        """Run the program on a PLY, to keep ``count`` Gaussians: the smaller scene, and the cost with reading and
-        writing. No file is left beside the PLY. Raises ProgramFailed if it fails, takes longer than ``timeout`` seconds
-        or writes no file, and SceneError if its file cannot be read."""
-        with tempfile.TemporaryDirectory(dir=source.parent) as folder:
-            target = Path(folder) / "small.ply"
-            args = self.command(source, count, target)
-            usage = run_measured(args, timeout)
-            if not target.is_file():
-                raise ProgramFailed(f"{shlex.join(args)} ended well but wrote no file")
-            return read_ply(target), usage
-
-
-class SplatTransform:
-    """splat-transform on the CPU.
-
-    Attributes:
-        version: such as "3.7.0".
-        missing: the reason why it cannot be run; empty if it can.
-        modes: its modes of decimation: ``--decimate``, and from version 3 on ``--decimate-adaptive``.
-
-    Args:
-        program: the path of the program; by default the one of this name on PATH. npx would run one of the current
-            folder, which may be a stranger's.
-    """
-
-    def __init__(self, program: str | None = None):
-        name = WAYS.splat_transform.name
-        self.command = [program or shutil.which(name) or name]
-        self.version = self.missing = ""
-        self.modes: tuple[Reducer, ...] = ()
-        try:
-            found = subprocess.run(
-                [*self.command, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            self.missing = f"{self.command[0]}: {error.__class__.__name__}"
-            return
-        version = re.search(r"(?:^|\s)v((\d{1,6})\.[\w.+-]{1,40})(?=\s|$)", found.stdout + found.stderr)
-        if found.returncode != 0 or version is None:
-            self.missing = f"{' '.join(self.command)} ended with {found.returncode}; is Node's package installed?"
-            return
-        self.version = version[1]
-        label = f"{name} {self.version}"
-        if int(version[2]) < 3:
-            self.modes = (self._mode(label, "--decimate"),)
-        else:
-            adaptive = self._mode(f"{label} adaptive", "--decimate-adaptive")
-            self.modes = (self._mode(f"{label} -d", "--decimate"), adaptive)
-
-    def _mode(self, label: str, option: str) -> Reducer:
-        def command(source: Path, count: int, target: Path) -> list[str]:
-            return [*self.command, "-w", "-g", "cpu", str(source), option, str(count), str(target)]
-
-        return Reducer(label, command)

@@ -1,229 +1,253 @@
-"""Measures the paper's tables on any scenes."""
+"""Measures the paper's tables on any scenes: a cell is one scene made smaller in one way."""
 
 from __future__ import annotations
 
-import dataclasses
+import fnmatch
 import functools
-import re
+import logging
+import shlex
+import subprocess
+import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean, median
+from typing import Annotated
 
-from lab.tables.cells import TABLE_FILES
-from lab.tables.journal import check_journal_folder
-from lab.tables.making import Refiners, Tools
-from lab.tables.means import Group
-from lab.tables.measuring import Measuring
-from lab.tables.outputs import write_tables
-from lab.tables.scene import OpenedScene, TableOptions, TableScene
-from lab.tables.ways import PROTOCOL
-from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+import torch
+import tyro
+
+import pointsplat_ns
+from lab.common.compare import lpips_or_none, metrics_of
+from lab.common.results import Row
+from lab.tables.cells import Tables
+from lab.tables.figure import distributions
+from lab.tables.layout import write_tables
+from lab.tables.making import Maker, Refiners, Tools
+from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
+from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
+from pointsplat_ns.cli.scene_options import Share
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.runs import Run, may_be_run, name_of, open_run
-from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views, has_masks
-from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
-from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.tradeoff.judging import JudgedViews
+from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.metrics import MOST_PSNR
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.views import View
+
+ROUNDS = 3
+"""Number of timed frames of each view; the fastest counts."""
+
+
+class Judge:
+    """Measures smaller scenes in the held-out views of one scene, whose renders are made once."""
+
+    @torch.no_grad()
+    def __init__(self, scene: OpenedScene):
+        self.scene = scene
+        self.reference = DenseReference(scene.dense, scene.held_out.views)
+        self.lpips = lpips_or_none(True)
+
+    @torch.no_grad()
+    def figures(self, small: Gaussians) -> Row:
+        """PSNR, SSIM and LPIPS against renders of the dense scene and against photos, and milliseconds of a frame."""
+        views, photos = self.scene.held_out.views, self.scene.held_out.photos
+        images = [render(small, view) for view in views]
+        against = {"against_dense": self._means(images, self.reference.renders)}
+        against["against_photos"] = None if photos is None else self._means(images, photos)
+        psnr = min(self.reference.closeness_of(images).psnr, MOST_PSNR)
+        against["against_dense"]["psnr"] = None if small is self.scene.dense else psnr
+        frame_ms = 1e3 * median(min(_seconds(small, view) for _ in range(ROUNDS)) for view in views)
+        return {**against, "frame_ms": frame_ms}
+
+    def _means(self, images: Sequence[torch.Tensor], targets: Sequence[torch.Tensor]) -> Row:
+        found = [metrics_of(image, target.to(image), self.lpips) for image, target in zip(images, targets, strict=True)]
+        return {"lpips": None} | {name: fmean(metrics[name] for metrics in found) for name in found[0]}
+
+
+def _seconds(scene: Gaussians, view: View) -> float:
+    start = time.perf_counter()
+    render(scene, view)
+    return time.perf_counter() - start
+
+
+def measured(scene: OpenedScene, output: Path, way: Way, share: float, maker: Maker, judge: Judge) -> Row:
+    """The cell of a scene, a way and a share of its Gaussians. ``point`` has its figures, and the command that measures
+    it again."""
+    name, tools = maker.name, maker.tools
+    small, seconds = maker.make(way, share)
+    key, size = cell_key(name, way, share), ply_bytes(len(small), small.sh_degree)
+    words = [str(scene.path), "-o", str(output), "--only", key, *tools.words(way, share, name)]
+    point = {"key": key, "label": way.label, "command": shlex.join(["python", "-m", "lab.tables", *words])}
+    point |= {"share": share, "gaussians": len(small), "sh_degree": small.sh_degree, "bytes": size, "seconds": seconds}
+    opacities, volumes = distributions(small) if (way, share) in WAYS.figure_4 else (None, None)
+    cell: Row = {"way": way.name, "point": point | judge.figures(small)}
+    cell |= {"made_with": tools.made_with(way, share, name), "seed": PROTOCOL.seed, "commit": source_commit()}
+    return cell | {"version": pointsplat_ns.__version__, "opacities": opacities, "volumes": volumes}
 
 
 def measure_tables(
-    scenes: Sequence[str | Path],
-    folder: str | Path,
+    scenes: tyro.conf.Positional[tuple[Path, ...]],
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     *,
-    keeps: Sequence[float] = PROTOCOL.shares,
-    refiners: Sequence[str | Path] = (),
-    groups: Sequence[str] = (),
-    only: Sequence[str] = (),
+    keeps: tuple[Share, ...] = PROTOCOL.shares,
+    refiners: tuple[Path, ...] = (),
+    groups: tuple[str, ...] = (),
+    only: tuple[str, ...] = (),
     views: int = 10,
     side: int = 640,
     scoring_views: int = 40,
     fine_tune: int = 300,
     splat_transform: str | None = None,
-    data: str | Path | None = None,
+    data: Path | None = None,
     force: bool = False,
-    progress: bool | Progress = False,
-) -> list[Group]:
+) -> tyro.conf.Suppress[Tables]:
     """Measure the paper's Tables 1 to 4 and Figure 4 on any scenes, with our methods and splat-transform beside.
 
-    Each cell, one scene made smaller in one way, is saved as soon as it is measured: the same call goes on after an
-    interruption. The tables are of all scenes in the folder, also those of earlier calls. Rows whose weights or program
-    are not at hand say so.
+    Each cell, one scene made smaller in one way, is saved as soon as it is measured: the same command resumes after an
+    interruption. The tables are of all scenes in the folder, also those of earlier commands.
 
     Args:
-        scenes: Splatfacto runs, whose held-out photos are then used where they are found; or files of scenes.
-        folder: where cells and tables go.
+        scenes: Splatfacto runs (folders or config.yml), whose held-out photos are then used where they are found; or
+            files of scenes.
+        output: folder for tables.json with all cells, tables.md, tables.tex and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network, as for :func:`~pointsplat_ns.load_refiner`; each row takes those
-            whose metadata name its network and pruning.
-        groups: NAME=SCENE,SCENE...; means are taken over groups. By default scenes of Replica and of ScanNet++ are a
-            group each, and the others are "scenes".
-        only: names or patterns of cells, such as ``fox/merge/10%``, to measure again, and no others.
+        refiners: weights for the rows with a network: runs or .safetensors files. Each row takes those with fitting
+            metadata.
+        groups: NAME=SCENE,SCENE...; means are taken over groups.
+        only: names or patterns of cells, such as fox/merge/10%. Only these are measured, also if they were before.
         views: largest number of held-out views of a scene.
         side: largest side of all images, pixels; photos are reduced.
-        scoring_views: largest number of training poses that LightGaussian and PUP-3DGS score from.
+        scoring_views: largest number of training poses for the scores of LightGaussian and PUP-3DGS.
         fine_tune: steps of fine-tuning, against at most 60 training photos.
-        splat_transform: the program; by default the one on PATH, if any.
-        data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
-            data is not found is measured without photos, which is logged.
-        force: start over.
-        progress: True shows a bar; a function is called with what is being done and the share done of it.
-
-    Returns:
-        The scenes of the folder in groups, with all cells.
-
-    Raises:
-        SceneError: if a scene or the folder is not usable, or the folder holds cells of other scenes, views or another
-            machine.
-        DataError: if there is no view.
-        WeightsError: if weights are none.
-        PointSplatError: if two scenes have the same name, nothing matches ``only``, or a number means nothing.
-        KeyboardInterrupt: after the tables of what was measured were written.
-
-    Example:
-        >>> import tempfile
-        >>> import pointsplat_ns as ps
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
-        ...     [group] = measure_tables(
-        ...         [f"{folder}/room.ply"], f"{folder}/tables", only=["room/paper/10%"], views=2, side=64
-        ...     )
-        >>> group.name, group.mean("paper", 0.1, frozenset({"room"})).gaussians
-        ('scenes', 30.0)
+        splat_transform: path of the program; by default the one on PATH.
+        data: folder above the data of the runs, or that of one, where it is no longer where the runs say; a run whose
+            data is not found is measured without photos, with a warning.
+        force: start over with the given scenes.
     """
-    folder = Path(folder)
-    options = TableOptions(views, side, scoring_views, fine_tune)
-    shares = tuple(dict.fromkeys(keeps))
-    if not all(0 < share < 1 for share in shares):
-        raise PointSplatError(f"keeps are {', '.join(f'{share:g}' for share in shares)}; expected shares such as 0.1")
+    logging.basicConfig(format="%(message)s")
+    logger.setLevel(logging.INFO)
+    options = Options(views, side, scoring_views, fine_tune)
+    if not all(0 < share < 1 for share in keeps):
+        raise PointSplatError(f"keeps are {', '.join(f'{share:g}' for share in keeps)}; expected shares such as 0.1")
     if not scenes:
         raise PointSplatError("no scene is named; expected Splatfacto runs, or files of scenes")
-    opened = [_table_scene(Path(path), data) for path in scenes]
-    opened = _grouped(opened, groups)
-    journals = [folder / scene.name / TABLE_FILES.cells for scene in opened]
-    check_journal_folder(folder, f"*/{TABLE_FILES.cells}", TABLE_FILES.results, force, journals)
-    tools = Tools(options, Refiners([Path(path) for path in refiners]), splat_transform)
-    with progress_bar(progress) as report:
-        measuring = Measuring(opened, folder, shares, tools, only, report)
+    paths = {name_of(Path(path)): Path(path) for path in scenes}
+    if len(paths) < len(scenes):
+        raise PointSplatError(f"two scenes have one name; expected different ones, found {', '.join(map(str, scenes))}")
+    tools = Tools(options, Refiners(refiners), splat_transform)
+    with claimed_folder(output):
+        tables = Tables.read(output, force)
+        for name, path in paths.items():
+            tables.enter(name, _about(path, data, options), _groups(groups, paths).get(name))
+        tables.missing = {}
+        wanted = _wanted(tables, paths, keeps, tools, only)
         try:
-            measuring.run()
-        except (KeyboardInterrupt, SystemExit):
-            if any(folder.glob(f"*/{TABLE_FILES.cells}")):
-                write_tables(folder, shares, measuring.missing)
-            raise
-        return write_tables(folder, shares, measuring.missing)
+            for name, cells in tracked(wanted.items(), "measuring", len(wanted)):
+                _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
+        finally:
+            write_tables(tables, output, keeps)
+    print(f"{output}: tables.md, tables.tex, tables.json and figure4.png")
+    return tables
 
 
-def _grouped(scenes: Sequence[TableScene], groups: Sequence[str]) -> list[TableScene]:
-    """Scenes with the groups that the user wants; a PointSplatError if a group is not understood, or names an unknown
+def _measure(
+    tables: Tables, output: Path, name: str, scene: OpenedScene, cells: list[tuple[Way, float]], tools: Tools
+) -> None:
+    """Measure cells of a scene and write each. A cell that cannot be made is left out, with the reason."""
+    shown = scene.held_out.views
+    about = {"views": len(shown), "width": shown.width, "height": shown.height, "origin": scene.origin}
+    tables.scenes[name] |= about | {"differs": "; ".join(scene.differs)}
+    maker, judge = Maker(scene, name, tools), Judge(scene)
+    for way, share in cells:
+        key = cell_key(name, way, share)
+        try:
+            cell = measured(scene, output, way, share, maker, judge)
+        except PointSplatError as error:  # other cells continue
+            tables.missing[key] = str(error)
+            logger.warning("%s: left out: %s", key, error)
+            continue
+        tables.cells[key] = cell
+        tables.save(output)
+        point = cell["point"]
+        psnr = {name: found["psnr"] for name in ("dense", "photos") if (found := point[f"against_{name}"])}
+        text = ", ".join(f"{value:.2f} dB against {what}" for what, value in psnr.items() if value is not None)
+        logger.info("%s: %s, %d Gaussians, %.1f s", key, text or "dense", point["gaussians"], point["seconds"])
+
+
+def _about(path: Path, data: Path | None, options: Options) -> Row:
+    """Facts on a scene, of which nothing is read but the hash of its file and, of a run, its settings."""
+    dataset = ""
+    if may_be_run(path):
+        try:
+            dataset = paper_dataset(open_run(path, data=data))
+        except SceneError:  # its data is gone
+            pass
+    about: Row = {"name": name_of(path), "path": str(path), "dataset": dataset, "machine": machine_text()}
+    asked = {name: value for name, value in asdict(options).items() if name != "fine_tune"}
+    return about | {"of": {"file": source_file(path).sha256, "machine": machine_text(), **asked}}
+
+
+def _groups(groups: Sequence[str], names: dict[str, Path]) -> dict[str, str]:
+    """The group of each scene that is named in one; a PointSplatError if a group is not understood, or names an unknown
     scene."""
-    wanted: dict[str, str] = {}
+    found: dict[str, str] = {}
     for text in groups:
         name, equals, members = text.partition("=")
         if not (name.strip() and equals and members.strip()):
             raise PointSplatError(f"group {text!r}: expected NAME=SCENE,SCENE, such as rooms=room201,room202")
-        wanted |= {member.strip(): name.strip() for member in members.split(",")}
-    unknown = sorted(set(wanted) - {scene.name for scene in scenes})
-    if unknown:
-        names = ", ".join(scene.name for scene in scenes)
-        raise PointSplatError(f"groups name {', '.join(unknown)}; expected some of the scenes {names}")
-    return [dataclasses.replace(scene, group=wanted.get(scene.name)) for scene in scenes]
+        found |= {member.strip(): name.strip() for member in members.split(",")}
+    if unknown := sorted(found.keys() - names):
+        raise PointSplatError(f"groups name {', '.join(unknown)}; expected some of the scenes {', '.join(names)}")
+    return found
 
 
-def _table_scene(path: Path, data: str | Path | None) -> TableScene:
-    """A scene, of which nothing is read but the hash of its file and, of a run, its settings."""
-    dataset = _dataset(path, data) if may_be_run(path) else ""
-    opened = functools.partial(_open, path, data)
-    return TableScene(name_of(path), path, source_file(path).sha256, dataset, None, opened)
+def _wanted(
+    tables: Tables, names: dict[str, Path], keeps: Sequence[float], tools: Tools, only: Sequence[str]
+) -> dict[str, list[tuple[Way, float]]]:
+    """The cells to measure, by scene: those that ``only`` names, or that lack a measurement with the same tools. What
+    cannot be measured is noted with the reason. Raises PointSplatError if ``only`` names none."""
+    wanted: dict[str, list[tuple[Way, float]]] = {}
+    named = 0
+    for name in names:
+        for way, share in WAYS.cells(keeps):
+            key = cell_key(name, way, share)
+            if only and not any(fnmatch.fnmatchcase(key, pattern) for pattern in only):
+                continue
+            named += 1
+            known = tables.cells.get(key)
+            if why := tools.missing(way, share, name):
+                tables.missing[key] = why
+            elif only or known is None or known["made_with"] != tools.made_with(way, share, name):
+                wanted.setdefault(name, []).append((way, share))
+    if not named:
+        raise PointSplatError(f"{', '.join(only)}: no such cell; expected a name such as fox/merge/10%, or a pattern")
+    return wanted
 
 
-def _dataset(path: Path, data: str | Path | None) -> str:
-    """The paper's dataset that a run belongs to; empty if none, or its data is gone."""
+@functools.cache
+def source_commit() -> str:
+    """The git commit of the package's source, 12 digits, with ``+`` where the package was changed since; empty if it is
+    not known."""
+    git = ["git", "-C", str(Path(pointsplat_ns.__file__).parent)]
     try:
-        return paper_dataset(open_run(path, data=data))
-    except SceneError:
+        found = [
+            subprocess.run([*git, *words], capture_output=True, text=True, timeout=20.0, check=True).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--", "."))
+        ]
+    except (OSError, subprocess.SubprocessError):
         return ""
+    return found[0][:12] + ("+" if found[1] else "")
 
 
-def _open(path: Path, data: str | Path | None, options: TableOptions) -> OpenedScene:
-    """Read a scene, its views, and its photos if there are any."""
-    dense = read_scene(path)
-
-    def new_views() -> ViewSource:
-        return ViewSource(dense, run=path, dataset_views=functools.partial(dataset_views, data=data))
-
-    held_out, training = _looked_at(path, data, options) or _sampled(new_views(), options)
-    judged = held_out.resized(options.side)
-    differs = _differences(path, data, dense, held_out, judged)
-    return OpenedScene(dense, judged, training.resized(options.side), new_views, differs)
-
-
-def _differences(
-    path: Path, data: str | Path | None, dense: Gaussians, held_out: JudgedViews, judged: JudgedViews
-) -> tuple[str, ...]:
-    """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000 Splatfacto steps, judged by
-    all held-out photos in their full size. ``held_out`` are the views before they are resized to the ``judged`` ones.
-    """
-    if held_out.photos is None:
-        return ("no held-out photos",)
-    run, found = open_run(path, data=data), []
-    everything = len(dataset_views(path, "test", data))
-    if len(held_out.views) < everything:
-        found.append(f"{len(held_out.views)} of {everything} held-out photos")
-    scale = run.datamanager_fields.get("camera_res_scale_factor", 1.0)
-    scale /= run.dataparser_fields.get("downscale_factor") or 1
-    if judged.views.width < held_out.views.width:
-        found.append(f"photos reduced to {judged.views.width} of {held_out.views.width} pixels in width")
-    elif scale != 1.0:
-        found.append(f"photos reduced to {scale:g} of their width")
-    if dense.sh_degree != 3:
-        found.append(f"SH degree {dense.sh_degree}")
-    if run.step + 1 < PROTOCOL.dense_steps:
-        found.append(f"{run.step + 1:,} of {PROTOCOL.dense_steps:,} Splatfacto steps")
-    if has_masks(path, "test", data):
-        found.append("masks are not applied")
-    return tuple(found)
-
-
-def _looked_at(path: Path, data: str | Path | None, options: TableOptions) -> tuple[JudgedViews, JudgedViews] | None:
-    """Held-out photos, and photos to train on; None if there are none."""
-    if not may_be_run(path):
-        return None
-    try:
-        held_out = JudgedViews(*dataset_photos(path, "test", options.views, data), "held-out photos")
-        training = dataset_photos(path, "train", options.training_views, data)
-        return held_out, JudgedViews(*training, "training photos")
-    except (SceneError, DataError) as error:
-        logger.warning("%s: no photos to compare with: %s", path, error)
-        return None
-
-
-def _sampled(source: ViewSource, options: TableOptions) -> tuple[JudgedViews, JudgedViews]:
-    """Views alone, to judge in and to train on."""
-    held_out = JudgedViews.compared(source, options.views)
-    return held_out, JudgedViews(source.views(options.training_views), None, source.origin)
-
-
-def paper_dataset(run: Run) -> str:
-    """The dataset of the paper that a run, opened with its data, was trained on: "Replica" or "ScanNet++"; empty if it
-    is another, or its data is gone."""
-    parser, name = run.dataparser_class.rpartition(".")[2], run.data.name
-    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on.
-    if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
-        try:
-            scene = load_replica(run.data, check_sizes=False)
-        except DataError:
-            return ""
-        size = (scene.params.width, scene.params.height)
-        # The rooms that this package makes may have the same names, but not this size and number.
-        return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
-    # By the dataset's own files, or by the COLMAP model among them, as the paper's authors read it.
-    parsers = {"SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig", "ColmapDataParserConfig"}
-    folders = (run.data, *run.data.parents) if parser == "ColmapDataParserConfig" else (run.data,)
-    if parser in parsers and any(
-        re.fullmatch(r"[0-9a-f]{10}", folder.name) and (folder / "dslr").is_dir() for folder in folders[:4]
-    ):
-        return "ScanNet++"
-    return ""
+def machine_text() -> str:
+    """Processor, number of threads and version of torch, as text."""
+    lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+    processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "CPU")
+    threads = torch.get_num_threads()
+    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}, cpu, torch {torch.__version__}"

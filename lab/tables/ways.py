@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.pruning.scores import DEFAULT_OPACITY_WEIGHT
-from pointsplat_ns.tradeoff.points import ImageMetrics
-from pointsplat_ns.tradeoff.settings import DENSE, Repair
 
 
 @dataclass(frozen=True)
@@ -47,14 +45,10 @@ class Network:
     use_position: bool = True
 
     def __str__(self) -> str:
-        names = {"dual": "dual encoder", "concat": "concat encoder"}
-        without = [
-            text
-            for used, text in ((self.use_appearance, "appearance branch"), (self.use_position, "position encoding"))
-            if not used
-        ]
-        words = names[self.encoder] + (f" without {' and '.join(without)}" if without else "")
+        parts = {"appearance branch": self.use_appearance, "position encoding": self.use_position}
+        without = " and ".join(part for part, used in parts.items() if not used)
         weight = "" if self.opacity_weight is None else f", lambda {self.opacity_weight:g}"
+        words = f"{self.encoder} encoder" + (f" without {without}" if without else "")
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
     def command(self, share: float) -> str:
@@ -89,8 +83,8 @@ class Way:
     """Whether the scene is fine-tuned against its training photos."""
     network: Network | None = None
     """The refiner; None for none."""
-    repair: Repair = "none"
-    """Effort of ``compact``."""
+    repaired: bool = False
+    """Whether ``compact`` makes it."""
     mode: int | None = None
     """Index of splat-transform's mode; None for other ways."""
 
@@ -99,7 +93,7 @@ class Way:
 class Ways:
     """All ways, and the rows that the tables have of them. A star in a label marks ways without fine-tuning."""
 
-    dense: Way = Way(DENSE, "3DGS (dense)")
+    dense: Way = Way("dense", "3DGS (dense)")
 
     # The paper's, by images of the scene.
     lightgaussian: Way = Way("lightgaussian", "LightGaussian*", "lightgaussian")
@@ -116,7 +110,7 @@ class Ways:
 
     # The defaults of this package's commands.
     merge: Way = Way("merge", "merge (our default)", "merge")
-    compact: Way = Way("compact", "compact", "merge", repair="quick")
+    compact: Way = Way("compact", "compact", "merge", repaired=True)
 
     # The modes of another program.
     splat_transform: Way = Way("splat-transform", "splat-transform", mode=0)
@@ -135,9 +129,16 @@ class Ways:
 
     @property
     def table_3(self) -> tuple[tuple[float, Way], ...]:
-        """Lambda and way of each row of Table 3."""
-        weights = PROTOCOL.opacity_weights
-        return tuple((weight, way(weight)) for weight in weights for way in (self.selected, self.refined))
+        """Lambda and way of each row of Table 3: the paper's selection, and refined."""
+        found: list[tuple[float, Way]] = []
+        for weight in PROTOCOL.opacity_weights:
+            selected, refined = self.paper, self.pointsplat
+            if weight != DEFAULT_OPACITY_WEIGHT:
+                network = Network(opacity_weight=weight)
+                selected = Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
+                refined = Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
+            found += [(weight, selected), (weight, refined)]
+        return tuple(found)
 
     @property
     def table_4(self) -> tuple[Way, ...]:
@@ -154,19 +155,6 @@ class Ways:
         """Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
         smaller = (self.lightgaussian, self.pup, self.paper, self.merge)
         return ((self.dense, 1.0), *((way, PROTOCOL.figure_share) for way in smaller))
-
-    def selected(self, weight: float) -> Way:
-        """The paper's selection at a lambda."""
-        if weight == DEFAULT_OPACITY_WEIGHT:
-            return self.paper
-        return Way(f"paper-{weight:g}", self.paper.label, "paper", weight)
-
-    def refined(self, weight: float) -> Way:
-        """The paper's selection at a lambda, refined."""
-        if weight == DEFAULT_OPACITY_WEIGHT:
-            return self.pointsplat
-        network = Network(opacity_weight=weight)
-        return Way(f"pointsplat-{weight:g}", self.pointsplat.label, "paper", weight, network=network)
 
     def cells(self, shares: Sequence[float]) -> list[tuple[Way, float]]:
         """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones
@@ -250,14 +238,14 @@ _PUBLISHED: dict[int, dict[tuple[str, float], tuple[float, ...]]] = {
 """PSNR (dB), SSIM and LPIPS on ScanNet++, then on Replica, by table, way and share."""
 
 
-def published(table: int, dataset: str, way: str, share: float) -> ImageMetrics | None:
-    """The paper's figures of a row, by its way and share, against held-out photos in table 1, 3 or 4; None if there are
-    none.
+def published(table: int, dataset: str, way: str, share: float) -> tuple[float, float, float] | None:
+    """The paper's PSNR (dB), SSIM and LPIPS of a row, by its way and share, against held-out photos in table 1, 3 or 4;
+    None if there are none.
 
     Example:
         >>> published(1, "Replica", "pointsplat", 0.1)
-        ImageMetrics(psnr=29.81, ssim=0.902, lpips=0.276)
+        (29.81, 0.902, 0.276)
     """
     figures = _PUBLISHED[table].get((way, share), ())
-    found = {"ScanNet++": figures[:3], "Replica": figures[3:]}.get(dataset)
-    return ImageMetrics(*found) if found else None
+    first = {"ScanNet++": 0, "Replica": 3}.get(dataset, len(figures))
+    return figures[first : first + 3] or None  # type: ignore[return-value]

@@ -2,7 +2,7 @@
 
     python -m lab.training.with_photos fox --steps 2000 --keep 0.1 0.3 --json with_photos.json \\
         --train "splatfacto-cpu --data scannetpp/fox scannetpp-seeded"
-    python -m lab.training.with_photos_record with_photos.json
+    python -m lab.training.with_photos --write with_photos.json      # docs/record/with_photos.md
 
 A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
 held-out photos, at the size of the photos. Each way is a process of its own, whose CPU seconds count, with starting and
@@ -22,15 +22,18 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated
 
+import pandas as pd
 import torch
 import tyro
 
 from lab.common.compare import lpips_or_none, metrics_of, photos_of
-from lab.common.printing import console, start, table
-from lab.common.results import Results, Row
+from lab.common.printing import markdown, percent, start
+from lab.common.results import Results, Row, grouped
 from lab.common.ways import count_of
+from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
 from pointsplat_ns.io import read_scene
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.nerfstudio_plugin.running import folder_of_run
@@ -55,6 +58,31 @@ SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, traine
 
 METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
 """All ways, in the order of the tables."""
+
+PAGE = f"""# With the photos at hand
+
+`lab/training/with_photos.py` measures who has the photos, and wants few Gaussians, and writes this page from
+[with_photos.json](with_photos.json). Constants of `compact --photos` and of the training with a
+cap are chosen on fox, kitchen and vr_project. The others judge.
+
+- PSNR, SSIM and LPIPS are means over all held-out photos, at the size of the photos that the dense scene is trained on.
+- CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
+  dense training, which all ways need but the training with a cap.
+- `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" trains on
+  them for as many seconds (`--seconds`) of the clock as the dense training took of the processor: about half
+  as many CPU seconds.
+- "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
+  them on the photos as `{COMPACTED}` does, with its splits and merges, for as many CPU seconds as
+  `{COMPACTED}` takes in all; reading and scores come on top. The methods' own schedules are longer.
+- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
+  seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
+- A way without a row was not measured there.
+- The machine was busy: CPU seconds of equal work differ by up to a half.
+- OpenSplat is not measured: at commit 15b7e80 it has no limit of Gaussians.
+"""
+
+HEADS = ("kept", "way", "Gaussians", "CPU s", "with dense", "PSNR", "SSIM", "LPIPS")
+
 
 _POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import program; program()")
 _TRAIN = (sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()")
@@ -161,13 +189,75 @@ def _cpu_seconds(words: list[str]) -> float:
     return run_measured(words).cpu_seconds or 0.0
 
 
+def page(rows: list[Row]) -> str:
+    """The page of all tables."""
+    parts = [PAGE.strip()]
+    leads = lead_table(rows)
+    if leads:
+        parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest to largest):\n\n{leads}")
+    for scene, same in sorted(grouped(rows, lambda row: row["scene"]).items()):
+        first = same[0]
+        size = f"{first['width']} x {first['height']}"
+        parts.append(
+            f"## {scene}\n\nDense: {first['steps']:,} steps. {first['photos']} held-out photos of {size}.\n\n"
+            + scene_table(same)
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def scene_table(rows: list[Row]) -> str:
+    """All ways for one capture, by budget."""
+    dense = next(row for row in rows if row["method"] == DENSE)
+    lines = []
+    for row in sorted(rows, key=lambda row: (-row["keep"], METHODS.index(row["method"]))):
+        with_dense = row["cpu_seconds"] + (dense["cpu_seconds"] if row["needs_dense"] else 0.0)
+        cells = [percent(row["keep"]), row["method"], f"{row['count']:,}"]
+        cells += [f"{row['cpu_seconds']:,.0f}", f"{with_dense:,.0f}", f"{row['psnr']:.2f}", f"{row['ssim']:.3f}"]
+        lines.append([*cells, f"{row['lpips']:.3f}" if "lpips" in row else "-"])
+    return markdown(HEADS, lines)
+
+
+def lead_table(rows: list[Row]) -> str:
+    """How much better ``compact --photos`` is than each way, over captures; empty if it has no row."""
+    psnr = pd.DataFrame(rows).pivot_table(index=["keep", "scene"], columns="method", values="psnr")
+    dense = {scene: value for (keep, scene), value in psnr[DENSE].dropna().items()}
+    psnr[DENSE] = psnr.index.get_level_values("scene").map(dense)
+    if COMPACTED not in psnr:
+        return ""
+    leads = psnr.rsub(psnr[COMPACTED], axis=0).drop(columns=COMPACTED)
+    keeps = sorted(set(psnr[COMPACTED].dropna().index.get_level_values("keep")), reverse=True)
+    lines = []
+    for method in (method for method in METHODS if method in leads):
+        found = [leads.loc[keep, method].dropna() for keep in keeps]
+        spans = [f"{f.mean():+.2f} ({f.min():+.2f} to {f.max():+.2f}), {len(f)}" if len(f) else "-" for f in found]
+        lines += [[method, *spans]] if any(map(len, found)) else []
+    return markdown(["over", *(f"{percent(keep)}, captures" for keep in keeps)], lines)
+
+
+def write(files: tuple[Path, ...], folder: Path) -> None:
+    """Write with_photos.json and with_photos.md from files of this program.
+
+    Raises:
+        SystemExit: if a file cannot be read, or there is no dense scene.
+    """
+    rows, settings = read(files, "with_photos.py")
+    if not any(row["method"] == DENSE for row in rows):
+        raise SystemExit(f"{', '.join(map(str, files))}: no row of a dense scene")
+    write_rows(rows, settings, folder / "with_photos.json")
+    with replacing(folder / "with_photos.md") as part:
+        part.write_text(page(rows), "utf-8")
+    print(folder / "with_photos.md")
+
+
 def main(
-    name: tyro.conf.Positional[str],
-    train: str,
+    name: tyro.conf.Positional[str] = "",
+    train: str = "",
     steps: int = 2000,
     keep: tuple[float, ...] = (0.1, 0.3),
     folder: Path = Path("outputs/with_photos"),
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+    write_from: Annotated[tuple[Path, ...], tyro.conf.arg(name="write")] = (),
+    record: Path = FOLDER,
 ) -> None:
     """Compare ways to a small scene of one capture, in its held-out photos.
 
@@ -178,7 +268,12 @@ def main(
         keep: shares of the Gaussians to keep.
         folder: for trainings and scenes.
         json_path: file of rows of this and other captures, taken up and written after each row.
+        write_from: only write the record, from these files.
+        record: folder of the record.
     """
+    if write_from:
+        write(write_from, record)
+        return
     lpips = lpips_or_none(True)
     results = Results(json_path, {"lpips": lpips is not None}, json_path is not None)
     folder.mkdir(parents=True, exist_ok=True)
@@ -191,14 +286,7 @@ def main(
     for row in measured(capture, keep, results.of(name)):
         results.put(name, [*results.of(name), row])
         print(row, flush=True)
-    heads = ("kept", "way", "Gaussians", "CPU s", "PSNR", "SSIM", "LPIPS")
-    ordered = sorted(results.of(name), key=lambda row: (-row["keep"], METHODS.index(row["method"])))
-    cells = [
-        (f"{100 * row['keep']:g} %", row["method"], f"{row['count']:,}", f"{row['cpu_seconds']:.0f}")
-        + tuple(f"{row[metric]:.3f}" if metric in row else "-" for metric in ("psnr", "ssim", "lpips"))
-        for row in ordered
-    ]
-    console().print(table(f"{name}: held-out photos", heads, cells, left=("way",)))
+    print(scene_table(results.of(name)))
 
 
 if __name__ == "__main__":

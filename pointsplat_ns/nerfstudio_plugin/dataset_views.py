@@ -80,10 +80,11 @@ def dataset_photos(
     return views, photos
 
 
-def has_masks(path: Path | str, split: Split, data: Path | str | None = None) -> bool:
-    """Whether photos of a split have masks. Arguments and errors are those of :func:`dataset_views`."""
+def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None) -> tuple[int, bool]:
+    """Number of photos of a split, and whether they have masks. Arguments and errors are those of
+    :func:`dataset_views`."""
     _, frames = _open(path, split, data)
-    return any(frames.dataset._dataparser_outputs.mask_filenames or ())
+    return len(frames), any(frames.dataset._dataparser_outputs.mask_filenames or ())
 
 
 def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
-from lab.tables.making import SplatTransform
+from lab.common.ways import SplatTransform
 from making import normal_scene
 
 REPOSITORY = Path(__file__).parents[2]

@@ -4,10 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-import pytest
-
-from lab.judge import ablation, scenes, variants
-from lab.judge import ablation_record as record
+from lab.judge import ablation, record, scenes
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 
@@ -19,29 +16,10 @@ def rows_of(path: Path) -> list[dict]:
 
 
 def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
-    changed = {field for found in variants.MERGING.values() for field in found}
+    changed = {field for found in ablation.VARIANTS.values() for field in found}
     assert changed == {field.name for field in dataclasses.fields(MergeSettings)}
-    assert len({*variants.names()}) == len(variants.names()) and variants.BASELINE not in variants.names()
-    for table in variants.TABLES.values():
-        for name, found in table.variants.items():
-            assert dataclasses.replace(table.defaults, **found) != table.defaults, name
-
-
-@dataclasses.dataclass(frozen=True)
-class Others:
-    """Settings of something else."""
-
-    a: int = 1
-    b: int = 2
-
-
-def test_a_variant_of_another_table_is_in_force_while_merging_runs(monkeypatch):
-    other = variants.Table("Others", Others(), {"a_2": {"a": 2}})
-    monkeypatch.setitem(variants.TABLES, "others", other)
-    with variants.applied("a_2") as settings:
-        assert settings is MERGING and other.defaults.a == 2
-    assert other.defaults.a == 1
-    assert variants.default_values()["others.a"] == 1 and variants.changes_of("a_2") == {"a": 2}
+    for name, found in ablation.VARIANTS.items():
+        assert dataclasses.replace(MERGING, **found) != MERGING, name
 
 
 def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
@@ -57,17 +35,17 @@ def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(smal
         assert (row["at"], row["keep"], row["gaussians"], row["changes"]) == (64, 0.2, 900, changes)
         assert row["cpu_seconds"] > 0
     assert len({row["covered_psnr"] for row in rows}) == 3
-    said = " ".join(capsys.readouterr().out.split())
-    assert all(name in said for name in TWO) and "20 %, dB" in said
+    said = capsys.readouterr().out
+    assert all(name in said for name in TWO) and "| 20 % |" in said
 
 
 def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, monkeypatch):
     [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     given, results = [], tmp_path / "rows.json"
 
-    def recorded(scene, k, progress, views, settings):
+    def recorded(scene, k, *, views, settings):
         given.append(views)
-        return merge(scene, k, progress, views, settings=settings)
+        return merge(scene, k, views=views, settings=settings)
 
     ablation.warm_up()
     monkeypatch.setattr(ablation, "merge", recorded)
@@ -76,14 +54,6 @@ def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, mo
     assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
 
 
-def row(scene: str, method: str, psnr: float, seconds: float, at: int | str = 960, keep: float = 0.1) -> dict:
-    known = {"scene": scene, "digest": "0", "gaussians": 1000, "at": at, "keep": keep, "method": method}
-    return known | {"changes": variants.changes_of(method), "covered_psnr": psnr, "cpu_seconds": seconds}
-
-
 def test_the_record_that_is_committed_has_the_page_of_its_rows():
-    files = [record.FOLDER / "ablation.json", record.FOLDER / "ablation.md"]
-    if not any(path.exists() for path in files):
-        pytest.skip("nothing is recorded yet")
-    rows, settings = record.read(files[:1], "ablation.py")
-    assert files[1].read_text("utf-8") == record.page(rows, settings)
+    rows, settings = record.read([record.FOLDER / "ablation.json"], "ablation.py")
+    assert (record.FOLDER / "ablation.md").read_text("utf-8") == ablation.page(rows, settings)

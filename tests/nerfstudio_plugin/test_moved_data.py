@@ -77,8 +77,8 @@ def test_tables_and_viewer_find_the_data_too(runs, moved, tmp_path):
     run = run_of(runs, "wall-b")
     with ps.open_viewer(run, port=0, data=moved) as viewer:
         assert "no dataset" not in viewer.origin
-    [group] = measure_tables([run], tmp_path / "t", only=["wall-b/paper/10%"], views=2, side=64, data=moved)
-    assert group.scenes[0].about.origin == "held-out photos"
+    found = measure_tables((run,), tmp_path / "t", only=("wall-b/paper/10%",), views=2, side=64, data=moved)
+    assert found.scenes["wall-b"]["origin"] == "held-out photos"
 
 
 def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(runs, trained_walls, tmp_path):

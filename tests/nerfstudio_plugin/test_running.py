@@ -8,15 +8,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from lab.tables import measure as measure_tables
-from lab.tables import outputs
-from lab.tables.measure import paper_dataset
-from making import ball, write_run
+from lab.tables import layout, scenes
+from lab.tables.measure import measure_tables
+from lab.tables.scenes import differences, paper_dataset
+from making import write_run
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.running import has_finished, remove_interrupted
-from pointsplat_ns.tradeoff.judging import JudgedViews
 
 
 def files(folder: Path) -> dict[Path, bytes]:
@@ -34,21 +32,19 @@ def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpo
 
 
 def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
-    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
     (config,) = (trained_walls / "wall-b").rglob("config.yml")
-    only = ["wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%"]
-    [group] = measure_tables.measure_tables([config.parent], tmp_path / "tables", only=only, fine_tune=8)
-    [scene] = group.scenes
+    only = ("wall-b/dense/*", "wall-b/lightgaussian/50%", "wall-b/lightgaussian-tuned/50%")
+    found = measure_tables((config.parent,), tmp_path / "tables", only=only, fine_tune=8)
+    about, points = found.scenes["wall-b"], {cell["way"]: cell["point"] for cell in found.cells.values()}
     views, photos = dataset_photos(config.parent, "test", 10)
     dense = ps.load(config.parent)
     errors = torch.stack([ps.psnr(ps.render(dense, view), photo) for view, photo in zip(views, photos, strict=True)])
-    points = {way: cell.point for (way, _), cell in scene.cells.items()}
-    assert points["dense"].against_photos.psnr == pytest.approx(float(errors.mean()), abs=1e-4)
-    assert points["lightgaussian-tuned"].against_photos.psnr > points["lightgaussian"].against_photos.psnr
-    assert points["lightgaussian-tuned"].against_dense.psnr < 100 and scene.about.origin == "held-out photos"
-    assert scene.about.dataset == "" and group.name == "scenes" and "Splatfacto steps" in scene.about.differs
-    written = json.loads((tmp_path / "tables" / "tables.json").read_text())
-    assert written["cells"][0]["point"]["against_photos"]["psnr"] == points["dense"].against_photos.psnr
+    psnr = {way: point["against_photos"]["psnr"] for way, point in points.items()}
+    assert psnr["dense"] == pytest.approx(float(errors.mean()), abs=1e-4)
+    assert psnr["lightgaussian-tuned"] > psnr["lightgaussian"]
+    assert points["lightgaussian-tuned"]["against_dense"]["psnr"] < 100 and about["origin"] == "held-out photos"
+    assert about["dataset"] == "" and about["group"] == "scenes" and "Splatfacto steps" in about["differs"]
 
 
 def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames: int = 2000) -> SimpleNamespace:
@@ -119,23 +115,18 @@ SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParse
         ({"sh_degree": 0}, ("SH degree 0",)),
         ({"step": 1999}, ("2,000 of 15,000 Splatfacto steps",)),
         ({"masks": True}, ("masks are not applied",)),
-        ({"photos": False}, ("no held-out photos",)),
         ({"seen": 1, "step": 0}, ("1 of 3 held-out photos", "1 of 15,000 Splatfacto steps")),
     ],
 )
 def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, differs):
     case = {"seen": 3, "side": 64, "scale": 1.0, "downscale": None, "sh_degree": 3, "step": 14_999, "masks": False}
-    case |= {"photos": True, **change}
-    poses = sample_views(ball(20), 3, 64, 48)
+    case |= change
     known = SimpleNamespace(
+        folder=Path("run"),
+        data=None,
         step=case["step"],
         datamanager_fields={"camera_res_scale_factor": case["scale"]},
         dataparser_fields={"downscale_factor": case["downscale"]},
     )
-    for name, value in (("open_run", known), ("dataset_views", poses), ("has_masks", case["masks"])):
-        monkeypatch.setattr(measure_tables, name, lambda *_, value=value, **options: value)
-    shown = poses[: case["seen"]]
-    photos = [torch.zeros(48, 64, 3) for _ in shown] if case["photos"] else None
-    held_out = JudgedViews(shown, photos, "held-out photos")
-    scene = ball(20, degree=case["sh_degree"])
-    assert measure_tables._differences(Path("run"), None, scene, held_out, held_out.resized(case["side"])) == differs
+    monkeypatch.setattr(scenes, "dataset_facts", lambda *_: (3, case["masks"]))
+    assert differences(known, case["sh_degree"], case["seen"], (case["side"], 64)) == differs

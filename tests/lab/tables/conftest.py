@@ -9,7 +9,8 @@ import torch
 
 import peers
 import pointsplat_ns as ps
-from lab.tables import outputs
+from lab.tables import layout
+from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from lab.tables.ways import Ways
 from making import box_room
@@ -54,14 +55,14 @@ def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
     none."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
-    monkeypatch.setattr(outputs, "plot_figure", lambda groups, path: path.write_text("a figure"))
+    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
 
 
 @pytest.fixture()
-def measured(room, tmp_path) -> Callable[..., list]:
+def measured(room, tmp_path) -> Callable[..., Tables]:
     """A function that measures the room's tables in a folder, at 30 %, with two steps of fine-tuning."""
 
     def measure(*scenes: Path, folder: Path = tmp_path / "tables", **options):

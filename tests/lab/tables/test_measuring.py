@@ -1,23 +1,25 @@
 """Tables of a small room, really measured: every way, what cannot be measured, and going on."""
 
 import json
+import shlex
+import sys
+from pathlib import Path
 
 import pytest
 
 import pointsplat_ns as ps
-from lab.tables.cells import TABLE_FILES
-from lab.tables.measure import measure_tables
+from lab.common.printing import start
+from lab.tables.cells import Tables
+from lab.tables.measure import Judge, measure_tables
 from lab.tables.ways import WAYS
 from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.tradeoff.judging import Judge
 
 
-def cells_of(group) -> dict:
-    """Cells of the only scene of a group, by way and share."""
-    [scene] = group.scenes
-    return scene.cells
+def cells_of(tables) -> dict:
+    """Cells of the only scene, by way and share."""
+    return {(cell["way"], cell["point"]["share"]): cell for cell in tables.cells.values()}
 
 
 @pytest.fixture()
@@ -37,54 +39,52 @@ def all_weights(weights):
 
 
 def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer, tmp_path):
-    [group] = measured(refiners=all_weights, splat_transform=peer())
-    cells = cells_of(group)
-    assert [*cells] == [(way.name, share) for way, share in WAYS.cells((0.3,))]
-    dense = cells["dense", 1.0].point
+    tables = measured(refiners=all_weights, splat_transform=peer())
+    cells = cells_of(tables)
+    assert {*cells} == {(way.name, share) for way, share in WAYS.cells((0.3,))} and tables.missing == {}
     for (way, share), cell in cells.items():
-        assert cell.point.gaussians == round(400 * share) and cell.point.key == f"room/{way}/{100 * share:g}%"
-        assert (
-            cell.point.command.startswith("python -m lab.tables ") and f"--only {cell.point.key}" in cell.point.command
+        point = cell["point"]
+        assert point["gaussians"] == round(400 * share) and point["key"] == f"room/{way}/{100 * share:g}%"
+        assert point["command"].startswith("python -m lab.tables ") and f"--only {point['key']}" in point["command"]
+        assert cell["version"] == ps.__version__ and cell["seed"] == 0 and point["frame_ms"] > 0
+        assert point["against_photos"] is None and (way == "dense" or point["against_dense"]["psnr"] < 100)
+        assert (cell["opacities"] is not None) == (
+            (way, share) in {(shown.name, kept) for shown, kept in WAYS.figure_4}
         )
-        assert cell.version == ps.__version__ and cell.seed == 0
-        assert cell.point.against_photos is None and (cell.point.against_dense.psnr < 100 or cell.point == dense)
-        assert (cell.opacities is not None) == ((way, share) in {(shown.name, kept) for shown, kept in WAYS.figure_4})
-    psnr = {way: cell.point.against_dense.psnr for (way, share), cell in cells.items() if share == 0.3}
+    psnr = {way: cell["point"]["against_dense"]["psnr"] for (way, share), cell in cells.items() if share == 0.3}
     assert psnr["lightgaussian-tuned"] != psnr["lightgaussian"] and psnr["pointsplat"] != psnr["paper"]
     assert psnr["splat-transform"] != psnr["splat-transform-adaptive"]
-    assert cells["splat-transform", 0.3].made_with == "splat-transform 3.7.0 -d"
-    assert cells["pup-tuned", 0.3].made_with == "2 steps"
-    assert cells["pointsplat", 0.3].made_with.endswith(
+    made_with = {way: cell["made_with"] for (way, share), cell in cells.items() if share == 0.3}
+    assert made_with["splat-transform"] == "splat-transform 3.7.0 -d" and made_with["pup-tuned"] == "2 steps"
+    assert made_with["pointsplat"].endswith(
         "(664,563 parameters; norm by scene; dual encoder, trained on scenes pruned by paper, lambda 0.3, "
         "keep 0.1, 0.3; steps 24)"
     )
     page = (tmp_path / "tables" / "tables.md").read_text()
-    assert "PointSplat (30 %): weights" in page and "PUP-3DGS (30 %)" in page
-    assert "--refiners" in cells["pointsplat", 0.3].point.command and "--fine-tune 2" in cells["pup", 0.3].point.command
-    content = json.loads((tmp_path / "tables" / "tables.json").read_text())
-    assert len(content["cells"]) == len(cells) and content["not_measured"] == {} and content["paper"] == {}
-    assert "not measured" not in (tmp_path / "tables" / "tables.md").read_text()
+    assert "PointSplat (30 %)" in page and "Made with 2 steps: LightGaussian (30 %)" in page
+    assert "--refiners" in cells["pointsplat", 0.3]["point"]["command"] and "not measured" not in page
+    assert Tables.read(tmp_path / "tables").cells == json.loads(json.dumps(tables.cells))
 
 
 def test_a_cell_is_what_the_functions_of_the_package_make(measured, room):
-    [group] = measured(only=["room/paper-0.7/*", "room/merge/*"])
+    cells = cells_of(measured(only=["room/paper-0.7/*", "room/merge/*"]))
     dense = ps.load(room)
     for way, share, small in (
         ("paper-0.7", 0.1, ps.prune(dense, 0.1, "paper", opacity_weight=0.7)),
         ("merge", 0.3, ps.prune(dense, 0.3)),
     ):
-        views = ps.sample_views(dense, 3, 48, 36)[[0, 2]]
-        wanted, _ = DenseReference(dense, views).psnr(small)
-        assert cells_of(group)[way, share].point.against_dense.psnr == pytest.approx(wanted, abs=1e-4)
+        wanted, _ = DenseReference(dense, ps.sample_views(dense, 2, 48, 36)).psnr(small)
+        assert cells[way, share]["point"]["against_dense"]["psnr"] == pytest.approx(wanted, abs=1e-4)
 
 
 def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights):
     """Weights that ship, or that were trained for another selection, stand in for nobody's."""
     other = weights("merged", {"by": "merge", "keep": 0.1})
-    [group] = measured(refiners=[other], only=["room/dense/*", "room/p*/*", "room/splat*/*"])
-    ways = {way for way, _ in cells_of(group)}
+    tables = measured(refiners=[other], only=["room/dense/*", "room/p*/*", "room/splat*/*"])
+    ways = {way for way, _ in cells_of(tables)}
     assert not ways & {"pointsplat", "pointsplat-0.1", "paper-splatformer", "splat-transform"} and "paper" in ways
     said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
+    assert said == tables.missing
     assert said["room/pointsplat/30%"].startswith("no weights were given (--refiners) of a dual encoder, trained on")
     assert said["room/splat-transform/30%"] == "splat-transform cannot be run (/no/such/program: FileNotFoundError)"
     rows = [line for line in (tmp_path / "tables" / "tables.md").read_text().splitlines() if "| PointSplat |" in line]
@@ -92,60 +92,55 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
 
 
 @pytest.mark.parametrize("trained", [{"keep": 0.1}, {"keep": 20_000}, {"keep": 0.1, "more_keeps": [0.2]}])
-def test_weights_of_another_budget_fill_no_row(measured, weights, tmp_path, trained):
+def test_weights_of_another_budget_fill_no_row(measured, weights, trained):
     other = weights("budget", {"by": "paper", **trained})
-    [group] = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
-    assert [*cells_of(group)] == [("paper", 0.3)]
-    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]["room/pointsplat/30%"]
-    assert said.endswith(
+    tables = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
+    assert [*cells_of(tables)] == [("paper", 0.3)]
+    assert tables.missing["room/pointsplat/30%"].endswith(
         "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual --pipeline.model.by paper "
         "--pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
     )
 
 
-def test_weights_that_know_the_scene_do_not_test_it(measured, weights, tmp_path):
+def test_weights_that_know_the_scene_do_not_test_it(measured, weights):
     knows = weights("knows", {"by": "paper", "keep": 0.3, "scenes": ["hall", "room"]})
-    measured(refiners=[knows], only=["room/pointsplat/*", "room/paper/*"])
-    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]
-    assert "were trained on this scene" in said["room/pointsplat/30%"]
+    tables = measured(refiners=[knows], only=["room/pointsplat/*", "room/paper/*"])
+    assert "were trained on this scene" in tables.missing["room/pointsplat/30%"]
 
 
-def test_a_program_that_fails_leaves_out_its_own_cell_alone(measured, peer, tmp_path, caplog):
-    [group] = measured(splat_transform=peer(fails="--decimate"), only=["room/splat*/*"])
-    assert [*cells_of(group)] == [("splat-transform-adaptive", 0.3)]
-    said = json.loads((tmp_path / "tables" / "tables.json").read_text())["not_measured"]["room/splat-transform/30%"]
-    assert "ended with status 1: out of luck" in said and "room/splat-transform/30%: left out: " in caplog.text
+def test_a_program_that_fails_leaves_out_its_own_cell_alone(measured, peer, caplog):
+    tables = measured(splat_transform=peer(fails="--decimate"), only=["room/splat*/*"])
+    assert [*cells_of(tables)] == [("splat-transform-adaptive", 0.3)]
+    assert "ended with status 1: out of luck" in tables.missing["room/splat-transform/30%"]
+    assert "room/splat-transform/30%: left out: " in caplog.text
 
 
 def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_path, monkeypatch):
-    judge, asked = Judge.judge, []
+    figures, asked = Judge.figures, []
 
-    def interrupted(self, scene, progress):
-        asked.append(len(scene))
+    def interrupted(self, scene):
+        asked.append(scene)
         if len(asked) == 4:
             raise KeyboardInterrupt
-        return judge(self, scene, progress)
+        return figures(self, scene)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Judge, "judge", interrupted)
+        patch.setattr(Judge, "figures", interrupted)
         with pytest.raises(KeyboardInterrupt):
             measured()
-    journal = tmp_path / "tables" / "room" / TABLE_FILES.cells
-    before = json.loads(journal.read_text())["cells"]
-    assert [cell["point"]["key"] for cell in before] == ["room/dense/100%", "room/paper/10%", "room/paper/30%"]
-    assert [cell["point"]["gaussians"] for cell in before] == asked[:3]
+    before = Tables.read(tmp_path / "tables").cells
+    assert [*before] == ["room/dense/100%", "room/paper/10%", "room/paper/30%"]
     assert "3DGS (dense)" in (tmp_path / "tables" / "tables.md").read_text()
-    measured()
-    assert json.loads(journal.read_text())["cells"][:3] == before  # also their times: they are not measured again
-    monkeypatch.setattr(Judge, "judge", lambda *args: pytest.fail("nothing is left to be measured"))
+    after = measured().cells
+    assert {key: after[key] for key in before} == before  # also their times: they are not measured again
+    monkeypatch.setattr(Judge, "figures", lambda *args: pytest.fail("nothing is left to be measured"))
     measured()
 
 
 def test_more_steps_are_measured_and_other_cells_left_alone(measured, few_ways):
-    [first] = measured()
-    [second] = measured(fine_tune=3)
-    assert cells_of(second)["lightgaussian-tuned", 0.3].made_with == "3 steps"
-    unchanged = [key for key, cell in cells_of(first).items() if cell == cells_of(second)[key]]
+    first, second = cells_of(measured()), cells_of(measured(fine_tune=3))
+    assert second["lightgaussian-tuned", 0.3]["made_with"] == "3 steps"
+    unchanged = [key for key, cell in first.items() if cell == second[key]]
     assert unchanged == [("dense", 1.0), ("paper", 0.1), ("paper", 0.3), ("lightgaussian", 0.3)]
 
 
@@ -153,13 +148,9 @@ def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
     ps.save(box_room(1, 300), tmp_path / "hall.ply")
     only = ["*/paper/30%", "*/dense/*"]
     measured(only=only, groups=["halls=room"])
-    groups = measured(tmp_path / "hall.ply", only=only)
-    assert [(group.name, [scene.about.name for scene in group.scenes]) for group in groups] == [
-        ("halls", ["room"]),
-        ("scenes", ["hall"]),
-    ]
-    groups = measured(tmp_path / "hall.ply", room, only=only, groups=["both=room,hall"])
-    assert [group.name for group in groups] == ["both"]
+    assert measured(tmp_path / "hall.ply", only=only).groups() == {"halls": ["room"], "scenes": ["hall"]}
+    both = measured(tmp_path / "hall.ply", room, only=only, groups=["both=room,hall"])
+    assert both.groups() == {"both": ["hall", "room"]}
 
 
 @pytest.mark.parametrize(
@@ -171,7 +162,7 @@ def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
         ({"fine_tune": -1}, "fine tune: -1; expected at least 1"),
         ({"groups": ["rooms"]}, "group 'rooms': expected NAME=SCENE,SCENE"),
         ({"groups": ["rooms=hall"]}, "groups name hall; expected some of the scenes room"),
-        ({"refiners": ["/no/such.safetensors"]}, "no such file"),
+        ({"refiners": [Path("/no/such.safetensors")]}, "no such file"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(measured, options, said):
@@ -182,7 +173,7 @@ def test_options_that_mean_nothing_are_refused(measured, options, said):
 def test_two_scenes_of_one_name_and_no_scene_are_refused(measured, room, tmp_path):
     (tmp_path / "other").mkdir()
     ps.save(box_room(1, 300), tmp_path / "other" / "room.ply")
-    with pytest.raises(PointSplatError, match="both are called room"):
+    with pytest.raises(PointSplatError, match="two scenes have one name"):
         measured(room, tmp_path / "other" / "room.ply")
     with pytest.raises(PointSplatError, match="no scene is named"):
         measure_tables([], tmp_path / "tables")
@@ -191,13 +182,23 @@ def test_two_scenes_of_one_name_and_no_scene_are_refused(measured, room, tmp_pat
 def test_cells_of_another_scene_or_of_other_views_are_refused_unless_forced(measured, room):
     only = ["room/dense/*"]
     measured(only=only)
-    with pytest.raises(SceneError, match="largest side"):
+    with pytest.raises(SceneError, match="of another side .640, now 40."):
         measured(only=only, side=40)
     ps.save(box_room(5, 200), room)
-    with pytest.raises(SceneError, match="are of another scene's tables .file"):
+    with pytest.raises(SceneError, match="of another file"):
         measured(only=only)
-    [group] = measured(only=only, force=True)
-    assert cells_of(group)["dense", 1.0].point.gaussians == 200
+    assert cells_of(measured(only=only, force=True))["dense", 1.0]["point"]["gaussians"] == 200
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", "null", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}']
+)
+def test_damaged_cells_are_refused_in_one_line(measured, tmp_path, content):
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "tables.json").write_text(content)
+    with pytest.raises(SceneError, match="tables.json: not the cells of tables .*--force") as refused:
+        measured()
+    assert "\n" not in str(refused.value)
 
 
 def test_files_of_others_are_not_overwritten(measured, tmp_path):
@@ -209,3 +210,15 @@ def test_files_of_others_are_not_overwritten(measured, tmp_path):
     with pytest.raises(SceneError, match="is a file"):
         measured(folder=tmp_path / "file")
     assert (tmp_path / "tables" / "tables.md").read_text() == "mine"
+
+
+def test_a_cells_command_measures_it_again(measured, room, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = measured(Path("room.ply"), folder=Path("tables"), only=["room/paper/30%"])
+    words = shlex.split(made.cells["room/paper/30%"]["point"]["command"])
+    assert words[:3] == ["python", "-m", "lab.tables"]
+    monkeypatch.setattr(sys, "argv", words[2:])
+    start(measure_tables)
+    again = Tables.read(tmp_path / "tables").cells["room/paper/30%"]["point"]
+    assert again["against_dense"] == made.cells["room/paper/30%"]["point"]["against_dense"]
+    assert again["command"] == made.cells["room/paper/30%"]["point"]["command"]

@@ -1,0 +1,161 @@
+"""The scenes of the tables: what they are, and the views and photos that they are judged by."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import pointsplat_ns as ps
+from lab.tables.ways import PROTOCOL
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import logger
+from pointsplat_ns.io.runs import Run, may_be_run, open_run
+from pointsplat_ns.io.scene import read_scene
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_facts, dataset_photos
+from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
+from pointsplat_ns.pruning import need_usable
+from pointsplat_ns.views import Views
+
+
+@dataclass(frozen=True)
+class Options:
+    """What measurements depend on beside the scene. Raises PointSplatError if an option is below 1."""
+
+    views: int = 10
+    """Largest number of held-out views of a scene."""
+    side: int = 640
+    """Longer side of the images for judging, fine-tuning and scoring, at most, pixels."""
+    scoring_views: int = 40
+    """Largest number of training poses for the scores of LightGaussian and PUP-3DGS."""
+    fine_tune: int = 300
+    """Steps of fine-tuning."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if value < 1:
+                raise PointSplatError(f"{name.replace('_', ' ')}: {value}; expected at least 1")
+
+    @property
+    def training_views(self) -> int:
+        """Largest number of views for fine-tuning and scoring. Their photos are in memory, at first in full size."""
+        return max(60, self.scoring_views)
+
+    @property
+    def words(self) -> list[str]:
+        """The options that are not defaults, as words of the command."""
+        usual = asdict(Options())
+        changed = {name: value for name, value in asdict(self).items() if value != usual[name]}
+        return [word for name, value in changed.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Views, and the photos (H, W, 3) that show the same, if there are some."""
+
+    views: Views
+    photos: list[Tensor] | None = None
+
+    def resized(self, side: int) -> Pictures:
+        """The same with at most ``side`` pixels on the longer side; photos are averaged over the areas of pixels."""
+        views = self.views.resized(side)
+        if self.photos is None or views is self.views:
+            return Pictures(views, self.photos)
+        size = (views.height, views.width)
+        areas = (
+            torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area") for photo in self.photos
+        )
+        return Pictures(views, [photo[0].permute(1, 2, 0) for photo in areas])
+
+
+@dataclass(frozen=True)
+class OpenedScene:
+    """The data of a scene."""
+
+    path: Path
+    data: Path | None
+    """Folder of its photos, if it is no longer where the run says."""
+    dense: Gaussians
+    held_out: Pictures
+    """Views to judge scenes in, with held-out photos where there are some."""
+    training: Pictures
+    """Views of scores and fine-tuning, with training photos where there are some."""
+    origin: str
+    """Origin of the views."""
+    differs: tuple[str, ...]
+    """Differences from the paper's protocol."""
+
+
+def open_scene(path: Path, data: Path | None, options: Options) -> OpenedScene:
+    """Read a scene, its views, and its photos if there are any. Raises SceneError if no Gaussian can be drawn."""
+    dense = read_scene(path)
+    need_usable(dense)
+    if may_be_run(path):
+        try:
+            whole = Pictures(*dataset_photos(path, "test", options.views, data))
+            held_out = whole.resized(options.side)
+            training = Pictures(*dataset_photos(path, "train", options.training_views, data)).resized(options.side)
+            size = held_out.views.width, whole.views.width
+            differs = differences(open_run(path, data=data), dense.sh_degree, len(held_out.views), size)
+            return OpenedScene(path, data, dense, held_out, training, "held-out photos", differs)
+        except (SceneError, DataError) as error:
+            logger.warning("%s: no photos to compare with: %s", path, error)
+    held_out = Pictures(ps.sample_views(dense, options.views, seed=1)).resized(options.side)
+    training = Pictures(ps.sample_views(dense, options.training_views)).resized(options.side)
+    return OpenedScene(path, data, dense, held_out, training, "sampled views", ("no held-out photos",))
+
+
+def differences(run: Run, sh_degree: int, seen: int, widths: tuple[int, int]) -> tuple[str, ...]:
+    """Differences of a scene's measurement from the paper's protocol: SH degree 3, 15,000 Splatfacto steps, judged by
+    all held-out photos in their full size.
+
+    Args:
+        run: with its data.
+        sh_degree: of the scene.
+        seen: number of held-out photos that it is judged by.
+        widths: of these, and of the photos as nerfstudio gives them, pixels.
+    """
+    found = []
+    every, masked = dataset_facts(run.folder, "test", run.data)
+    if seen < every:
+        found.append(f"{seen} of {every} held-out photos")
+    scale = run.datamanager_fields.get("camera_res_scale_factor", 1.0)
+    scale /= run.dataparser_fields.get("downscale_factor") or 1
+    if widths[0] < widths[1]:
+        found.append(f"photos reduced to {widths[0]} of {widths[1]} pixels in width")
+    elif scale != 1.0:
+        found.append(f"photos reduced to {scale:g} of their width")
+    if sh_degree != 3:
+        found.append(f"SH degree {sh_degree}")
+    if run.step + 1 < PROTOCOL.dense_steps:
+        found.append(f"{run.step + 1:,} of {PROTOCOL.dense_steps:,} Splatfacto steps")
+    if masked:
+        found.append("masks are not applied")
+    return tuple(found)
+
+
+def paper_dataset(run: Run) -> str:
+    """The dataset of the paper that a run, opened with its data, was trained on: "Replica" or "ScanNet++"; empty if it
+    is another, or its data is gone."""
+    parser, name = run.dataparser_class.rpartition(".")[2], run.data.name
+    # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on.
+    if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
+        try:
+            scene = load_replica(run.data, check_sizes=False)
+        except DataError:
+            return ""
+        size = (scene.params.width, scene.params.height)
+        # The rooms that this package makes may have the same names, but not this size and number.
+        return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
+    # By the dataset's own files, or by the COLMAP model among them, as the paper's authors read it.
+    parsers = {"SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig", "ColmapDataParserConfig"}
+    folders = (run.data, *run.data.parents) if parser == "ColmapDataParserConfig" else (run.data,)
+    if parser in parsers and any(
+        re.fullmatch(r"[0-9a-f]{10}", folder.name) and (folder / "dslr").is_dir() for folder in folders[:4]
+    ):
+        return "ScanNet++"
+    return ""

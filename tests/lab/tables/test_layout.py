@@ -1,0 +1,174 @@
+"""Tables of cells that are known in advance."""
+
+import json
+import re
+
+import pytest
+import torch
+
+from lab.tables import figure, layout
+from lab.tables.cells import FILES, Tables
+from lab.tables.figure import OPACITY_EDGES, VOLUME_EDGES, distributions, medians
+from lab.tables.layout import Layout, Table, latex_table, markdown_table, write_tables
+from lab.tables.ways import WAYS, cell_key
+from making import ball
+
+
+def add_scene(tables, name, group="scenes", dataset="", worse=0.0, photos=True, without=(), differs=""):
+    """Add the cells of a scene of 1,000 Gaussians at 30 and 10 %, in all ways but those without."""
+    about = {"name": name, "path": name, "dataset": dataset, "group": group, "origin": "held-out photos"}
+    about |= {"machine": "a machine", "views": 3, "width": 64, "height": 48, "differs": differs}
+    tables.scenes[name] = about
+    for number, (way, share) in enumerate(WAYS.cells((0.3, 0.1))):
+        if way.name in without:
+            continue
+        lost, key = 0.0 if way == WAYS.dense else 1 + worse + 0.1 * number, cell_key(name, way, share)
+        point = {"key": key, "label": way.label, "command": "", "share": share, "sh_degree": 3, "seconds": 1.5}
+        point |= {"gaussians": round(1000 * share), "bytes": round(248_000 * share), "frame_ms": 10 * share}
+        point["against_dense"] = {"psnr": 40 - lost if lost else None, "ssim": 0.9, "lpips": 0.1}
+        point["against_photos"] = {"psnr": 30 - lost, "ssim": 0.8, "lpips": 0.2} if photos else None
+        cell = {"way": way.name, "point": point, "made_with": "", "seed": 0, "version": "0.1.0", "commit": ""}
+        for kind, edges in (("opacities", OPACITY_EDGES), ("volumes", VOLUME_EDGES)):
+            counts = [0] * 9 + [7] + [0] * (len(edges) - 11)
+            cell[kind] = counts if (way, share) in WAYS.figure_4 else None
+        tables.cells[key] = cell
+    return tables
+
+
+def tables_of(tables, keeps=(0.3,)):
+    """Tables 1 to 4 of the only group."""
+    [(group, names)] = tables.groups().items()
+    return Layout(tables, group, names, keeps).tables()[:4]
+
+
+def rows_of(table: Table) -> dict[tuple[str, str], tuple[str, ...]]:
+    return {row[:2]: row[2:] for row in table.rows}
+
+
+def photos_psnr(tables, key):
+    return tables.cells[key]["point"]["against_photos"]["psnr"]
+
+
+def test_distributions_count_every_gaussian_once():
+    scene = ball(50)
+    opacities, volumes = distributions(scene)
+    assert sum(opacities) == sum(volumes) == 50
+    assert opacities[-1] == int((scene.alphas >= 1 - 1 / len(opacities)).sum())
+    flat = scene.replace(scales=torch.full_like(scene.scales, -float("inf")))
+    assert distributions(flat)[1][0] == 50
+
+
+def test_tables_have_the_papers_rows():
+    tables = add_scene(Tables(), "fox")
+    one, two, three, four = tables_of(tables)
+    assert len(one.rows) == 25 and one.header[:5] == ("kept", "method", "PSNR", "SSIM", "LPIPS")
+    first, merged = rows_of(one), photos_psnr(tables, "fox/merge/10%")
+    assert first["100 %", "3DGS (dense)"] == ("30.00", "0.800", "0.200", "-", "0.900", "0.100", "fox 30.00", "1")
+    row = first["10 %", "merge (our default)"]
+    assert (row[0], row[6]) == (f"{merged:.2f}", f"fox {merged:.2f} ({merged - 30:+.2f})")
+    assert rows_of(two)["10 %", "PUP-3DGS"] == ("100", "1e+03", "0.0248", "1")
+    names = [(weight, name) for weight in ("0.1", "0.3", "0.5", "0.7", "0.9") for name in ("PointSplat*", "PointSplat")]
+    assert [row[:2] for row in three.rows] == names
+    assert [row[0] for row in four.rows] == ["I", "II", "III", "IV", "V"]
+    assert all(len(row) == len(table.header) for table in (one, two, three, four) for row in table.rows)
+
+
+def test_a_table_takes_its_means_over_the_same_scenes():
+    """A dense scene more changes no row, and a row that lacks a scene is marked."""
+    every = {way.name for way, _ in WAYS.cells((0.3, 0.1))}
+    tables = add_scene(Tables(), "fox")
+    add_scene(tables, "kitchen", worse=2.0, without=("pointsplat",))
+    add_scene(tables, "attic", worse=9.0, without=(*(every - {"dense"}),))
+    one, two, _, four = tables_of(tables)
+    assert one.title.endswith("2 scenes") and rows_of(one)["100 %", "3DGS (dense)"][-1] == "2"
+    both = [photos_psnr(tables, f"{name}/paper/10%") for name in ("fox", "kitchen")]
+    row = rows_of(one)["10 %", "PointSplat*"]
+    assert row[0] == f"{sum(both) / 2:.2f}" and row[6] == f"kitchen {both[1]:.2f} ({both[1] - 30:+.2f})"
+    assert rows_of(one)["10 %", "PointSplat"][-1] == rows_of(two)["10 %", "PointSplat"][-1] == "1 †"
+    assert any("not over the scenes of the other rows (fox, kitchen)" in note for note in one.notes)
+    assert [row[-1] for row in four.rows] == ["2", "2", "2", "2", "1 †"]
+
+
+def test_a_mean_of_photos_needs_photos_of_all_scenes():
+    tables = add_scene(add_scene(Tables(), "fox"), "splat", photos=False)
+    psnr = f"{tables.cells['fox/merge/10%']['point']['against_dense']['psnr']:.2f}"
+    assert rows_of(tables_of(tables)[0])["10 %", "merge (our default)"][:4] == ("-", "-", "-", psnr)
+    alone = tables_of(add_scene(Tables(), "splat", photos=False))[0]
+    assert "PSNR" not in alone.header and rows_of(alone)["10 %", "merge (our default)"][3] == f"splat {psnr}"
+
+
+@pytest.mark.parametrize(
+    "datasets, expected",
+    [(("Replica",) * 2, "Replica"), (("Replica", ""), ""), (("", ""), ""), (("nuScenes",) * 2, "")],
+)
+def test_a_group_is_of_a_dataset_if_all_its_scenes_are(datasets, expected):
+    tables = Tables()
+    for number, dataset in enumerate(datasets):
+        add_scene(tables, f"room{number}", "Replica", dataset)
+    assert tables.dataset(["room0", "room1"]) == expected
+
+
+def test_names_cannot_leave_their_cells_nor_start_commands():
+    name = "a|b\n\\input{/etc/passwd} % $x^2$ ~ &"
+    table = Table(1, name, (name, "b"), [(name, "c")], [name])
+    text = latex_table(table)
+    assert r"\input" not in re.sub(r"^%.*$", "", text, flags=re.MULTILINE)
+    assert all(line.count(" & ") == 1 for line in text.splitlines() if line.endswith(r"\\"))
+    rows = [line for line in markdown_table(table).splitlines() if line.startswith("| ")]
+    assert [len(re.findall(r"(?<!\\)\|", row)) for row in rows] == [3, 3]
+
+
+@pytest.fixture()
+def written(monkeypatch, tmp_path):
+    """A function that writes tables without the figure, and gives the text of all files."""
+    monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
+
+    def write(tables):
+        write_tables(tables, tmp_path, (0.3, 0.1))
+        return {name: (tmp_path / name).read_text() for name in FILES}
+
+    return write
+
+
+@pytest.mark.parametrize("name, dataset", [("room0", ""), ("office0", ""), ("410c470782", ""), ("room0", "replica")])
+def test_the_papers_figures_never_stand_beside_other_datasets(written, name, dataset):
+    """Whatever scenes and groups are called."""
+    tables = add_scene(Tables(), name, "Replica", dataset)
+    files = written(tables)
+    assert not [column for table in tables_of(tables) for column in table.header if "paper" in column]
+    text = files["tables.md"] + files["tables.tex"]
+    assert json.loads(files["tables.json"])["paper"] == {}
+    assert "(paper)" not in text and "39.40" not in text and "29.81" not in text
+
+
+def test_they_stand_beside_ours_where_the_dataset_is_the_same(written):
+    tables = add_scene(Tables(), "room0", "Replica", "Replica")
+    add_scene(tables, "0a5c013435", "ScanNet++", "ScanNet++")
+    files = written(tables)
+    assert [*tables.groups()] == ["ScanNet++", "Replica"]
+    one, two, three, four = Layout(tables, "Replica", ["room0"], ()).tables()[:4]
+    assert one.header[-3:] == three.header[-3:] == ("scenes", "PSNR (paper)", "SSIM (paper)")  # its LPIPS is by VGG
+    assert rows_of(one)["10 %", "PointSplat"][-2:] == ("29.81", "0.902")
+    assert rows_of(one)["10 %", "merge (our default)"][-2:] == ("-", "-")
+    assert "paper" not in str(two.header) and "paper" not in str(four.header)  # the paper does not say of which scenes
+    first = Layout(tables, "ScanNet++", ["0a5c013435"], ()).tables()
+    assert rows_of(first[3])["V", "yes"][-2:] == ("23.46", "0.855")
+    assert json.loads(files["tables.json"])["paper"]["Replica"]["table 1, pup, 10%"]["psnr"] == 17.34
+
+
+def test_another_protocol_than_the_papers_is_named_in_place_of_its_figures(written):
+    tables = add_scene(Tables(), "room0", "Replica", "Replica")
+    add_scene(tables, "room1", "Replica", "Replica", differs="10 of 200 held-out photos")
+    files = written(tables)
+    assert tables.dataset(["room0", "room1"]) == "Replica" and tables.comparable(["room0", "room1"]) == ""
+    assert "| 64 x 48 | 10 of 200 held-out photos |" in files["tables.md"]
+    assert "PSNR (paper)" not in files["tables.md"] and json.loads(files["tables.json"])["paper"] == {}
+
+
+def test_figure_4_is_drawn_and_its_medians_are_those_of_the_bins(tmp_path):
+    tables = add_scene(Tables(), "fox")
+    add_scene(tables, "hall", "halls", without=("paper", "merge", "pup", "lightgaussian", "dense"))
+    figure.plot_figure(tables.cells, tables.groups(), tmp_path / "figure4.png")
+    assert (tmp_path / "figure4.png").read_bytes()[:4] == b"\x89PNG"
+    assert medians(tables.cells, ["hall"]) == {}
+    assert medians(tables.cells, ["fox"])["dense"] == (pytest.approx(9.5 / 40), pytest.approx(-20 + 9.5 / 2))
