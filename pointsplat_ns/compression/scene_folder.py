@@ -32,7 +32,7 @@ from pointsplat_ns.io.scene import read_scene, save_as
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, progress_bar
-from pointsplat_ns.system.workers import WorkerKilled, Workers
+from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs
 
 SCENES_FORMAT = "pointsplat-scenes"
 
@@ -146,8 +146,7 @@ def run_on_folder(
 ) -> list[SceneResult]:
     """Run a command on every scene of a folder, and write the results to another folder. Arguments, results and errors
     are those of :func:`~pointsplat_ns.folders.compact_folder`."""
-    if jobs < 1:
-        raise DataError(f"jobs is {jobs}; expected 1 or more")
+    check_jobs(jobs)
     part = part_of(shard)
     everything = _tasks(folder, output, command.suffix)
     tasks = everything[part]

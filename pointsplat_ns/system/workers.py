@@ -6,6 +6,7 @@ process was killed, and the other processes go on.
 
 from __future__ import annotations
 
+import functools
 import os
 import pickle
 import signal
@@ -20,7 +21,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.threads import THREADS_VARIABLE, fixed_threads
 
@@ -80,17 +81,26 @@ class Workers(Generic[Item, Result]):
                     again.append(item)
                     waiting.append(item)
 
+    @functools.cached_property
+    def _pickled(self) -> bytes:
+        return pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
+
     def _give(self, item: Item) -> None:
         """Let an idle process, or a new one, work on an item."""
         if self._idle:
             pool = self._idle.pop()
         else:
-            # Pickled here, as multiprocessing would move tensors into shared memory.
-            pool = ProcessPoolExecutor(1, self._context, _begin, (self._ends, pickle.dumps(self._function)))
+            pool = ProcessPoolExecutor(1, self._context, _begin, (self._ends, self._pickled))
         try:
             self._busy[pool.submit(_call, item)] = pool, item
         except BrokenProcessPool:  # it was killed while it had nothing to do
             self._give(item)
+
+
+def check_jobs(jobs: int) -> None:
+    """Raise a DataError if a number of processes is not positive."""
+    if jobs < 1:
+        raise DataError(f"jobs is {jobs}; expected 1 or more")
 
 
 def threads_for(jobs: int) -> int:
@@ -99,20 +109,20 @@ def threads_for(jobs: int) -> int:
     return torch.get_num_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
 
 
+_function: Callable[[], Callable[[Any], Any]]
+"""In a process of :class:`Workers`: gives its function."""
+
+
 def _begin(ends: connection.Connection, function: bytes) -> None:
     """The start of a process, which ends with the one that started it. Ctrl-C is for that one."""
     global _function
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(ends,), daemon=True).start()
-    _function = pickle.loads(function)
-
-
-_function: Callable[[Any], Any]
-"""The function of this process, if it is one of :class:`Workers`."""
+    _function = functools.cache(functools.partial(pickle.loads, function))
 
 
 def _call(item: Any) -> Any:
-    return _function(item)
+    return _function()(item)
 
 
 def _end_with(ends: connection.Connection) -> None:
