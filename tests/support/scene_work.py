@@ -1,11 +1,14 @@
-"""What tests do to scenes of a folder, also in other processes."""
+"""What tests do in other processes, also to scenes of a folder."""
 
 import os
 import signal
+import time
 from pathlib import Path
 
+import torch
+
 from pointsplat_ns.compression.scene_folder import SmallerScene
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 
 
@@ -23,3 +26,11 @@ def halve(scene: Gaussians, path: Path, journal: Path) -> SmallerScene:
     if path.stem.startswith("deadly") or (path.stem.startswith("killed") and seen == 1):
         os.kill(os.getpid(), signal.SIGKILL)
     return SmallerScene(scene[::2], 30.0)
+
+
+def where(seconds: float) -> tuple[int, int]:
+    """The process, and its number of threads, after some seconds."""
+    time.sleep(seconds)
+    if seconds < 0.1:
+        raise DataError("too short")
+    return os.getpid(), torch.get_num_threads()
