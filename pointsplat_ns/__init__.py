@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.placing import place
+    from pointsplat_ns.compression.scene_folder import SceneResult
     from pointsplat_ns.compression.scene_info import SceneInfo, info
-    from pointsplat_ns.compression.scene_task import SceneResult
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.filming import open_viewer, render_path
@@ -56,7 +56,7 @@ _PUBLIC = {
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.compression.placing": ("place",),
     "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
-    "pointsplat_ns.compression.scene_task": ("SceneResult",),
+    "pointsplat_ns.compression.scene_folder": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.looking.sampling": ("sample_views",),

@@ -13,20 +13,24 @@ from pointsplat_ns.compression.placing import place
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import quality_of_pruned
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.scene_folder import Command, Shard, output_folder, run_on_folder
-from pointsplat_ns.compression.scene_task import CommandOptions, SceneResult, SmallerScene
+from pointsplat_ns.compression.scene_folder import (
+    Command,
+    CommandOptions,
+    SceneResult,
+    SmallerScene,
+    output_folder,
+    run_on_folder,
+)
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_like, format_to_write
-from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import Keep, cut_sh
-from pointsplat_ns.system.processes import connect_torchrun, gathered, torchrun_device, torchrun_rank
-from pointsplat_ns.system.progress import Progress, progress_bar, silent
+from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.finding import find_scene
 from pointsplat_ns.tradeoff.measure import subject_of
@@ -59,8 +63,7 @@ def compact_folder(
     """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
 
     Unchanged results of the same scene and options are kept, so another call continues an interrupted one. Several
-    calls may work on the same folders at the same time; one of them claims each scene. Under ``torchrun`` each process
-    works on a part, waits for the others, and returns the results of all.
+    calls may work on the same folders at the same time; one of them claims each scene.
 
     Args:
         folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
@@ -108,9 +111,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
-    connect_torchrun()
-    device = str(torchrun_device())
-    trained = _refiner_on(refiner, device)
+    trained = _loaded(refiner)
     size = parse_resolution(resolution)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
@@ -127,10 +128,10 @@ def compact_folder(
     }
     if targets is not None:
         options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
-        make = functools.partial(_found, refiner, device, targets, request.prune.by, repairs_of(effort), size, data)
+        make = functools.partial(_found, refiner, targets, request.prune.by, repairs_of(effort), size, data)
     else:
-        make = functools.partial(_compacted, refiner, device, replace(request, refiner=None), size, data)
-    return _run(folder, target, Command("compact", make, options), jobs, shard, force, progress)
+        make = functools.partial(_compacted, refiner, replace(request, refiner=None), size, data)
+    return run_on_folder(folder, target, Command("compact", make, options), jobs, shard, force, progress)
 
 
 def prune_folder(
@@ -163,7 +164,7 @@ def prune_folder(
         **({} if data is None else {"data": str(data)}),
     }
     command = Command("prune", functools.partial(_pruned, request, size, data), options)
-    return _run(folder, output, command, jobs, shard, force, progress)
+    return run_on_folder(folder, output, command, jobs, shard, force, progress)
 
 
 def convert_folder(
@@ -188,42 +189,29 @@ def convert_folder(
     options: CommandOptions = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
     options = options if offset is None else {**options, "offset": str(offset)}
     command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame, offset), options, suffix)
-    return _run(folder, output, command, jobs, shard, force, progress)
+    return run_on_folder(folder, output, command, jobs, shard, force, progress)
 
 
-def _run(
-    folder: Path, output: Path, command: Command, jobs: int, shard: str | None, force: bool, progress: bool | Progress
-) -> list[SceneResult]:
-    """The results of all processes of ``torchrun``, sorted by name."""
-    part = Shard() if shard is None else Shard.of(shard)
-    rank, world_size = torchrun_rank()
-    connect_torchrun()
-    with progress_bar(progress if rank == 0 else False) as report:
-        results = run_on_folder(folder, output, command, jobs, part.within(rank, world_size), force, report)
-    return sorted(gathered(results), key=lambda result: result.name)
-
-
-_refiner_on = functools.cache(refiner_at)
+_loaded = functools.cache(refiner_at)
 
 
 def _compacted(
     refiner: str | Path | None,
-    device: str,
     request: CompactRequest,
     resolution: tuple[int, int] | None,
     data: str | Path | None,
+    dense: Gaussians,
     path: Path,
 ) -> SmallerScene:
     """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
-    dense, options = read_scene(path), request.prune
     source = _views_of(dense, path, resolution, data)
-    if (whole := _kept_whole(dense, options, source)) is not None:
+    if (whole := _kept_whole(dense, request.prune, source)) is not None:
         return whole
-    request = replace(request, prune=options.in_format(format_like(path)), refiner=_refiner_on(refiner, device))
+    request = replace(request, prune=request.prune.in_format(format_like(path)), refiner=_loaded(refiner))
     result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
-    return SmallerScene(result.scene, len(dense), result.psnr, source.missing[2:-1])
+    return SmallerScene(result.scene, result.psnr, source.missing[2:-1])
 
 
 def _views_of(dense: Gaussians, path: Path, resolution: tuple[int, int] | None, data: str | Path | None) -> ViewSource:
@@ -238,20 +226,19 @@ def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> 
         return None
     note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
     kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
-    return SmallerScene(kept, len(dense), None, note, same)
+    return SmallerScene(kept, None, note, same)
 
 
 def _pruned(
-    request: PruneRequest, resolution: tuple[int, int] | None, data: str | Path | None, path: Path
+    request: PruneRequest, resolution: tuple[int, int] | None, data: str | Path | None, dense: Gaussians, path: Path
 ) -> SmallerScene:
     """Prune one scene of a folder."""
-    dense = read_scene(path)
     source = _views_of(dense, path, resolution, data)
     if (whole := _kept_whole(dense, request, source)) is not None:
         return whole
     pruned = prune_scene(dense, request.in_format(format_like(path)), source)
     quality = quality_of_pruned(dense, pruned, source)
-    return SmallerScene(pruned.scene, len(dense), None if quality is None else quality.psnr, source.missing[2:-1])
+    return SmallerScene(pruned.scene, None if quality is None else quality.psnr, source.missing[2:-1])
 
 
 def _converted(
@@ -260,29 +247,28 @@ def _converted(
     scale: float,
     original_frame: bool,
     offset: Sequence[float] | Literal["centre"] | None,
+    dense: Gaussians,
     path: Path,
 ) -> SmallerScene:
     """One scene of a folder for another format."""
-    dense = read_scene(path)
     cut = dense if sh == "all" else cut_sh(dense, int(sh))
-    return SmallerScene(place(cut, up, scale, path if original_frame else None, offset), len(dense), None)
+    return SmallerScene(place(cut, up, scale, path if original_frame else None, offset))
 
 
 def _found(
     refiner: str | Path | None,
-    device: str,
     targets: Targets,
     by: str,
     repairs: tuple[Repair, ...],
     resolution: tuple[int, int] | None,
     data: str | Path | None,
+    dense: Gaussians,
     path: Path,
 ) -> SmallerScene:
     """Find the cheapest version of one scene of a folder that meets targets."""
-    dense = read_scene(path)
     suffix = format_like(path).suffix
-    subject = subject_of(dense, path, None, _refiner_on(refiner, device), suffix, resolution, data=data)
+    subject = subject_of(dense, path, None, _loaded(refiner), suffix, resolution, data=data)
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene
-    return SmallerScene(result.scene, len(dense), result.psnr)
+    return SmallerScene(result.scene, result.psnr)

@@ -119,8 +119,7 @@ def compact(
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
         jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
-        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all. Under torchrun each
-            process takes its part.
+        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         threads: number of threads of each process. By default it adapts to the work and to other programs. Another
             number may change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.

@@ -11,7 +11,7 @@ from pointsplat_ns.cli.printing import print_json
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.scene_task import SceneResult
+    from pointsplat_ns.compression.scene_folder import SceneResult
 
 
 def folder_command(
@@ -42,7 +42,6 @@ def folder_command(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.discovery import FOLDER_FILES
-    from pointsplat_ns.system.processes import torchrun_rank
     from pointsplat_ns.system.threads import fixed_threads
 
     for name, given in refused.items():
@@ -50,8 +49,6 @@ def folder_command(
             raise ps.SceneError(f"{name} is for one scene; {folder} is a folder of scenes")
     with fixed_threads(threads):
         results = run(folder, output, jobs=1 if jobs is None else jobs, progress=True, **options)
-    if torchrun_rank()[0] > 0:
-        return  # the first process speaks for all
     failed = sum(result.status == "failed" for result in results)
     if json_output:
         print_json({"output": output, "scenes": [asdict(result) for result in results]})

@@ -91,11 +91,12 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         force: overwrite existing files.
-        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
+        jobs: for a folder, or a scene merged in parts: number of processes that share scenes or parts, and the cores;
+            by default 1.
         shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
-            parts, with files beside the output; a command that was killed goes on. Under torchrun, processes share
-            the parts; each may take so much.
+            parts, with files beside the output; a command that was killed goes on. With --jobs each process may take
+            so much.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
         verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
@@ -105,10 +106,9 @@ def prune(
     from pointsplat_ns.compacting import prune_source
     from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
-    from pointsplat_ns.errors import PointSplatError, SceneError
+    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.scene import is_folder_of_scenes
-    from pointsplat_ns.system.processes import by_first, connect_torchrun, world_size
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
@@ -121,25 +121,20 @@ def prune(
             keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
             resolution=resolution, data=data, shard=shard, force=force,
         )  # fmt: skip
-    need_no_folder_options(scene, jobs, shard)
+    need_no_folder_options(scene, None, shard)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
-    connect_torchrun()
-    by_first(lambda: claim_outputs(written, force, plot))
+    claim_outputs(written, force, plot)
     request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune).in_format(format_to_write(output))
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
-    if world_size() > 1 and (rows is None or memory is None):
-        raise PointSplatError(
-            f"{scene}: {world_size()} processes share the parts of a scene larger than --memory; expected one process, "
-            "or a --memory that the scene does not fit into"
-        )
     if rows is not None:
         if dry_run or plot is not None:
             raise SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
         with fixed_threads(threads):
-            _prune_in_parts(rows, output, request, memory, poses, resolution, up, json_output)
+            _prune_in_parts(rows, output, request, memory, jobs, poses, resolution, up, json_output)
         return
+    need_no_folder_options(scene, jobs, shard)
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
             scene, request, poses, resolution, up, data, progress=True, compared=True
@@ -165,6 +160,7 @@ def _prune_in_parts(
     output: Path,
     request: PruneRequest,
     memory: float | None,
+    jobs: int | None,
     poses: Path | None,
     resolution: str | None,
     up: str | None,
@@ -175,14 +171,13 @@ def _prune_in_parts(
     from pointsplat_ns.io.ply import PlyRows
     from pointsplat_ns.looking.sizes import parse_resolution
     from pointsplat_ns.looking.upright import up_named
-    from pointsplat_ns.system.processes import rank
     from pointsplat_ns.system.progress import progress_bar
 
     size, limit = parse_resolution(resolution), None if memory is None else 1e6 * memory
-    with progress_bar(rank() == 0) as report:
-        before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report)
-    if rank() > 0:
-        return  # the first process speaks for all
+    with progress_bar() as report:
+        before, seconds = prune_file(
+            rows, output, request, limit, poses, size, up_named(up), report, jobs=1 if jobs is None else jobs
+        )
     small = PlyRows.open(output)
     assert small is not None
     if json_output:

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import (
     Megabytes,
@@ -32,7 +31,7 @@ from pointsplat_ns.pruning import (
     score_of,
     select,
 )
-from pointsplat_ns.pruning.merging import Merger
+from pointsplat_ns.pruning.merging import Merger, merge
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 
@@ -68,30 +67,36 @@ def prune_scene(
         raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
     views = views or ViewSource(dense)
-    notes: list[str] = []
-    rendered: list[Views] = []  # the views of each scene that was merged
-    full = _with_sh(dense, request.sh, views, progress, notes)
+    full, notes = _with_sh(dense, request.sh, views, progress)
     count = request.count_of(len(full), full.sh_degree, full.traits)
-    start, cleaning, limit = full, None, None
+    start, cleaning, limit, seen = full, None, None, None
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene
 
         cleaning = clean_scene(dense, count or 1, views, progress)
         start = cleaning.apply(full, count or 1)
-        notes += cleaning.notes
+        notes = [*notes, *cleaning.notes]
     report = functools.partial(progress, f"by {request.by}")
-    if count is not None:
-        method_views, weight = _views_of_method(request, views), request.opacity_weight
-        scene = prune(start, count, request.by, method_views, weight, report, rendered.append)
+    scored = functools.partial(views.scored, VIEW_COUNTS.scored)
+    merging = request.method.score is None
+    if count is not None and merging:
+        merged = merge(start, count, report, views.for_merging())
+        logger.debug("%s", merged.finish.note)
+        scene, seen = merged.scene, merged.views
+    elif count is not None:
+        scene = prune(start, count, request.by, scored, request.opacity_weight, report)
     else:
-        make = _pruner(start, request, views, report, rendered)
+        merger = Merger(start, views.for_merging()) if merging else None
+        make = _selector(start, request, scored, report) if merger is None else lambda k: merger.merged(k).scene
         if cleaning is not None:
             make = _refilling(make, cleaning, full, len(start))
         searching = functools.partial(progress, "trying counts")
         if isinstance(request.budget, Megabytes):
-            scene, limit = _for_size(dense, start, make, request.budget, views, searching, notes)
+            scene, limit, note = _for_size(dense, start, make, request.budget, views, searching)
         else:
-            scene, limit = _for_psnr(dense, make, request.budget, views, searching, notes)
+            scene, limit, note = _for_psnr(dense, make, request.budget, views, searching)
+        notes = [*notes, note]
+        seen = None if merger is None else merger.views
     if request.fine_tune:
         from pointsplat_ns.compression.fine_tune import fine_tune
 
@@ -102,13 +107,13 @@ def prune_scene(
         notes.insert(0, views.text)
     if limit is not None and rounding:
         scene = limit.rounded(scene)
-    return Pruned(scene, tuple(notes), rendered[-1] if rendered else None, limit)
+    return Pruned(scene, tuple(notes), seen, limit)
 
 
-def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, notes: list[str]) -> Gaussians:
-    """The scene with the SH bands that ``sh`` keeps; adds a line to ``notes``."""
+def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, list[str]]:
+    """The scene with the SH bands that ``sh`` keeps, and a line on them unless it keeps all."""
     if sh == "all":
-        return dense
+        return dense, []
     reached = ""
     if sh == "auto":
         from pointsplat_ns.compression.budget_search import needed_sh_degree
@@ -120,43 +125,18 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress, n
     else:
         degree = int(sh)
     if degree >= dense.sh_degree:
-        notes.append(f"SH degree {dense.sh_degree} kept")
-        return dense
+        return dense, [f"SH degree {dense.sh_degree} kept"]
     lost = 100 * energy_lost(dense, degree)
     cut = f"SH degree {dense.sh_degree} cut to {degree}"
-    notes.append(f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}")
-    return cut_sh(dense, degree)
+    return cut_sh(dense, degree), [f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}"]
 
 
-def _views_of_method(request: PruneRequest, views: ViewSource) -> Views | Sampler | Callable[[], Views] | None:
-    """The views that a method needs: known ones for merging, or the sampler of the scene."""
-    if request.method.needs_views:
-        return functools.partial(views.scored, VIEW_COUNTS.scored)
-    return views.for_merging() if request.method.score is None else None
-
-
-def _pruner(
-    scene: Gaussians,
-    request: PruneRequest,
-    views: ViewSource,
-    progress: Callable[[float], None],
-    rendered: list[Views],
+def _selector(
+    scene: Gaussians, request: PruneRequest, views: Callable[[], Views], progress: Callable[[float], None]
 ) -> Callable[[int], Gaussians]:
-    """A function from a count to a scene of that many Gaussians. Scores, and the rounds of merging that counts share,
-    are computed once. The views that merging rendered are added to ``rendered``."""
-    method = request.method
-    if method.score is None:
-        merger = Merger(scene, views.for_merging())
-
-        def made(count: int) -> Gaussians:
-            merged = merger.merged(count)
-            rendered.extend([] if merged.views is None else [merged.views])
-            return merged.scene
-
-        return made
+    """A function from a count to so many Gaussians of the highest scores, which are computed once."""
     progress(0.0)
-    scored = functools.partial(views.scored, VIEW_COUNTS.scored)
-    scores = score_of(scene, method, scored, request.opacity_weight, progress)
+    scores = score_of(scene, request.method, views, request.opacity_weight, progress)
     return lambda count: scene[select(scores, count)]
 
 
@@ -174,10 +154,9 @@ def _for_psnr(
     budget: object,
     views: ViewSource,
     progress: Callable[[float], None],
-    notes: list[str],
-) -> tuple[Gaussians, FileLimit | None]:
-    """The smallest scene with a PSNR against ``dense`` and, if a format rounds its numbers, the limit of its file: the
-    scene has the PSNR when it is rounded. ``make`` gives the scene of a count. Adds a line to ``notes``."""
+) -> tuple[Gaussians, FileLimit | None, str]:
+    """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
+    scene has the PSNR when it is rounded; and a line on the search. ``make`` gives the scene of a count."""
     from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 
     assert isinstance(budget, WithinPsnr)
@@ -193,11 +172,11 @@ def _for_psnr(
         return limit.rounded(scene)
 
     reached = smallest_within(dense, made, compared, budget.value, progress)
-    notes.append(
+    note = (
         f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
         f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
     )
-    return whole.get(reached.count, reached.scene), limit
+    return whole.get(reached.count, reached.scene), limit, note
 
 
 def _for_size(
@@ -207,10 +186,9 @@ def _for_size(
     budget: Megabytes,
     views: ViewSource,
     progress: Callable[[float], None],
-    notes: list[str],
-) -> tuple[Gaussians, FileLimit]:
-    """The largest scene whose compressed file has a size, before rounding, and the rounding; ``start`` is the largest
-    scene allowed, ``make`` gives the scene of a count. Adds a line to ``notes``."""
+) -> tuple[Gaussians, FileLimit, str]:
+    """The largest scene whose compressed file has a size, before rounding, the rounding, and a line on the search;
+    ``start`` is the largest scene allowed, ``make`` gives the scene of a count."""
     from pointsplat_ns.compression.budget_search import FileLimit, largest_within
 
     limit = FileLimit(format_to_write(budget.suffix), check_size(budget, len(dense)))
@@ -219,5 +197,5 @@ def _for_size(
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
-    notes.append(f"{len(found.tried)} sizes tried for {bytes_text(limit.most)} as {limit.kind.name}")
-    return found.scene, found.limit
+    note = f"{len(found.tried)} sizes tried for {bytes_text(limit.most)} as {limit.kind.name}"
+    return found.scene, found.limit, note

@@ -22,8 +22,8 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 from pointsplat_ns.pruning.merging.settings import MERGING
-from pointsplat_ns.system.processes import first_alone, rank
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.workers import check_jobs
 from pointsplat_ns.views import Views
 
 
@@ -103,9 +103,9 @@ def prune_file(
     resolution: tuple[int, int] | None = None,
     up: Up | None = None,
     progress: Progress = silent,
+    jobs: int = 1,
 ) -> tuple[int, float]:
     """Merge a PLY cell by cell. A call that was killed goes on where it was, from a hidden folder beside the output.
-    Processes that ``torchrun`` connected share the cells, each within ``memory``.
 
     Args:
         rows: the scene, as of :func:`rows_to_prune`.
@@ -116,6 +116,7 @@ def prune_file(
         resolution: width and height of views, pixels.
         up: which way is up, for sampled views; by default what the scene declares, or estimated.
         progress: called with what is being done, and the share done of it.
+        jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:
         The number of Gaussians before, those that cannot be drawn left out, and seconds.
@@ -124,9 +125,10 @@ def prune_file(
         PointSplatError: if the memory is too small.
         SceneError: if a file cannot be read or written, or the disk has no room for what lies between.
         BudgetError: if the budget does not fit the scene.
-        DataError: if the cameras are not usable.
+        DataError: if the cameras are not usable, or the number of jobs is not valid.
     """
     start = time.perf_counter()
+    check_jobs(jobs)
     if output.suffix.lower() != ".ply" or output.name.lower().endswith(".compressed.ply"):
         raise SceneError(
             f"{output}: is written as a whole; expected a .ply for a scene larger than memory, which "
@@ -160,11 +162,10 @@ def prune_file(
 
     count = count_of(rows.count)  # errors before the work
     size = rows.count * (_row_bytes(rows) + MEMORY.between) + count * _row_bytes(rows)
-    scratch = first_alone(lambda: Scratch(output.with_name(f".{output.name}.cells"), work, size))
+    scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
-    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress)
-    if rank() == 0:
-        scratch.remove()
+    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs)
+    scratch.remove()
     return before, time.perf_counter() - start
 
 

@@ -1,74 +1,96 @@
-"""Runs a command on every scene of a folder, in shards and in several processes, and writes a table of the results."""
+"""Runs a command on every scene of a folder, and writes a table of the results.
+
+The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the hashes of the input
+file with the options, and of the result itself. While a process works on the scene it holds the lock ``.room.ply.lock``
+and writes to the folder ``.room.ply.part``.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
+import hashlib
 import json
+import math
 import os
 import re
-from collections.abc import Callable, Generator, Mapping, Sequence
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
-from pointsplat_ns.compression.scene_task import (
-    CommandOptions,
-    SceneResult,
-    SceneTask,
-    SmallerScene,
-    known_result,
-    make_result,
-    note_failure,
-    remove_unfinished,
-)
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import logger, read_text, replacing
-from pointsplat_ns.io.formats import format_like
+from pointsplat_ns.io.files import content_hash, json_text, logger, one_line, read_text, replacing, write_json
+from pointsplat_ns.io.formats import format_like, format_to_read, format_to_write
+from pointsplat_ns.io.scene import read_scene, save_as
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
-from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.workers import in_processes, in_turn
+from pointsplat_ns.system.progress import Progress, progress_bar
+from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs
 
 SCENES_FORMAT = "pointsplat-scenes"
 
+Status = Literal["done", "done before", "failed", "open"]
+
+CommandOptions = Mapping[str, str | float | bool | None]
+"""The options that a result depends on."""
+
 
 @dataclass(frozen=True)
-class Shard:
-    """One of several parts of a list, as ``2/5``: the second of five.
-
-    Raises:
-        DataError: if the index is not in 1..count.
+class SceneResult:
+    """The result of one of many scenes.
 
     Example:
-        >>> Shard.of("2/3").part(list("abcdefg"))
-        ['b', 'e']
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::100], f"{folder}/rooms/hall.ply")
+        ...     [result] = ps.compact_folder(f"{folder}/rooms", keep="50%", effort="instant")
+        >>> result.name, result.status, result.before, result.after
+        ('hall', 'done', 629, 315)
     """
 
-    index: int = 1
-    """From 1 on."""
-    count: int = 1
+    name: str
+    """Path of the scene below its folder, without a suffix."""
+    source: str
+    """Path of the file or run that was read."""
+    output: str
+    """Path of the file that was written."""
+    status: Status
+    """``done before``: by an earlier call, or by another process. ``open``: not finished, in the table of all."""
+    before: int | None = None
+    """Gaussians of the scene."""
+    after: int | None = None
+    """Gaussians of the result."""
+    megabytes: float | None = None
+    """Size of the result, 10^6 bytes."""
+    psnr: float | None = None
+    """PSNR against the scene's own renders, dB; None if nothing was compared or they are equal."""
+    seconds: float | None = None
+    """Duration."""
+    error: str = ""
+    """The error in one line; empty if there was none."""
+    note: str = ""
+    """A remark on the result; empty if there is none."""
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.index <= self.count:
-            raise DataError(f"shard {self.index}/{self.count}; expected 1/{self.count} to {self.count}/{self.count}")
 
-    @classmethod
-    def of(cls, text: str) -> Shard:
-        """The shard of a text such as ``2/5``."""
-        numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-        if numbers is None:
-            raise DataError(f"shard {text!r}; expected which one of how many, such as 1/4")
-        return cls(int(numbers[1]), int(numbers[2]))
+@dataclass(frozen=True)
+class SmallerScene:
+    """A smaller scene, and figures for the table."""
 
-    def within(self, rank: int, world_size: int) -> Shard:
-        """The part of this shard for one of several processes, by its rank from 0 on."""
-        return Shard((self.index - 1) * world_size + rank + 1, self.count * world_size)
-
-    def part(self, items: Sequence) -> list:
-        """The items of this part: every ``count``-th one."""
-        return list(items[self.index - 1 :: self.count])
+    scene: Gaussians
+    psnr: float | None = None
+    """PSNR against the dense scene's renders, dB; None if nothing was compared."""
+    note: str = ""
+    """A remark for the table."""
+    same: bool = False
+    """Whether this is the dense scene itself, whose file is copied if its format stays."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +99,40 @@ class Command:
     or a partial of one."""
 
     name: str
-    make: Callable[[Path], SmallerScene]
+    make: Callable[[Gaussians, Path], SmallerScene]
+    """From a dense scene and its path to a smaller one."""
     options: CommandOptions
     """All options that ``make`` depends on."""
     suffix: str | None = None
     """Suffix of the results; None for the format of each scene."""
 
+
+@dataclass(frozen=True)
+class SceneTask:
+    """A scene to work on, and the file to write."""
+
+    name: str
+    source: Path
+    output: Path
+
+    def result(self, status: Status, **facts: Any) -> SceneResult:
+        """A result of this scene."""
+        return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
+
     @property
-    def description(self) -> dict[str, object]:
-        """The content of the file that describes the results of a folder."""
-        return {"format": SCENES_FORMAT, "command": self.name, "options": dict(self.options)}
+    def record(self) -> Path:
+        """The file with the figures and hashes of the result."""
+        return self.output.with_name(f"{self.output.name}.json")
+
+    @property
+    def lock(self) -> Path:
+        """The file that a process locks while it works on the scene."""
+        return self.output.with_name(f".{self.output.name}.lock")
+
+    @property
+    def unfinished(self) -> Path:
+        """The folder for unfinished files, which whoever holds the lock may remove."""
+        return self.output.with_name(f".{self.output.name}.part")
 
 
 def run_on_folder(
@@ -94,49 +140,57 @@ def run_on_folder(
     output: Path,
     command: Command,
     jobs: int = 1,
-    shard: Shard = Shard(),
+    shard: str | None = None,
     force: bool = False,
-    progress: Progress = silent,
+    progress: bool | Progress = False,
 ) -> list[SceneResult]:
-    """Run a command on every scene of a folder, and write the results to another folder.
-
-    Finished results are kept, so the next call continues an interrupted call. Several processes may work on the same
-    folders at the same time; one of them claims each scene.
-
-    Args:
-        folder: searched by :func:`~pointsplat_ns.io.discovery.find_scenes`.
-        output: folder for ``NAME.ply``, or another format that a scene is in, its record ``NAME.ply.json``, and the
-            table ``scenes.csv``.
-        command: the command.
-        jobs: number of processes; 1 uses the calling process.
-        shard: the part of the scenes to work on.
-        force: overwrite files of other origin or with other options.
-
-    Returns:
-        The results of the shard's scenes, in the order of their names.
-
-    Raises:
-        DataError: if ``jobs`` is not positive.
-        SceneError: if there are no scenes, or the output folder holds other results.
-    """
-    if jobs < 1:
-        raise DataError(f"jobs is {jobs}; expected 1 or more")
+    """Run a command on every scene of a folder, and write the results to another folder. Arguments, results and errors
+    are those of :func:`~pointsplat_ns.folders.compact_folder`."""
+    check_jobs(jobs)
+    part = part_of(shard)
     everything = _tasks(folder, output, command.suffix)
-    tasks = shard.part(everything)
+    tasks = everything[part]
     _check_and_describe(output, command, force)
     results: dict[str, SceneResult] = {}
-    work = functools.partial(make_result, make=command.make, options=command.options, force=force)
     try:
-        with contextlib.closing(_results(work, tasks, jobs)) as finished:
-            progress(command.name, 0.0)
-            for result in finished:
-                results[result.name] = result
-                progress(command.name, len(results) / len(tasks))
-                if result.status == "failed":
-                    logger.warning("%s failed: %s", result.name, result.error)
+        with progress_bar(progress) as report, Workers(functools.partial(_make_result, command, force), jobs) as work:
+            report(command.name, 0.0)
+            for wait in (False, True):  # at last for those that another command works on
+                left = [(task, wait) for task in tasks if task.name not in results]
+                for (task, _), result in work.results(left):
+                    if isinstance(result, WorkerKilled):
+                        result = task.result("failed", error=str(result))
+                    if result is None:
+                        continue
+                    results[task.name] = result
+                    report(command.name, len(results) / len(tasks))
+                    if result.status == "failed":
+                        logger.warning("%s failed: %s", result.name, result.error)
     finally:  # also after an interruption
+        for task in tasks:
+            if task.name not in results or results[task.name].status == "failed":
+                _clean(task)
         _write_table(output, everything, results)
     return [results[task.name] for task in tasks]
+
+
+def part_of(shard: str | None) -> slice:
+    """The part of a list that a shard such as ``2/5`` names: every fifth item from the second on; all for None.
+
+    Raises:
+        DataError: if there is no such part.
+
+    Example:
+        >>> "abcdefg"[part_of("2/3")]
+        'be'
+    """
+    numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard or "1/1")
+    if numbers is None:
+        raise DataError(f"shard {shard!r}; expected which one of how many, such as 1/4")
+    index, count = int(numbers[1]), int(numbers[2])
+    if not 1 <= index <= count:
+        raise DataError(f"shard {shard}; expected 1/{count} to {count}/{count}")
+    return slice(index - 1, None, count)
 
 
 def output_folder(folder: Path, suffix: str) -> Path:
@@ -154,79 +208,144 @@ def _tasks(folder: Path, output: Path, suffix: str | None) -> list[SceneTask]:
     ]
 
 
-def _results(
-    work: Callable[[SceneTask], SceneResult | None], tasks: Sequence[SceneTask], jobs: int
-) -> Generator[SceneResult, None, None]:
-    if jobs == 1:
-        return in_turn(work, tasks)
-    # Slow imports are made once, before processes are forked.
-    slow = ("pointsplat_ns.folders", "kornia.metrics", "plyfile", "safetensors.torch", "scipy.spatial")
-    return in_processes(work, tasks, jobs, _given_up, _clear, preload=slow)
-
-
-def _given_up(task: SceneTask, how: str) -> SceneResult:
-    """The result of a scene whose processes were killed repeatedly."""
-    _clear(task)
-    failed = task.result("failed", error=f"every process that worked on it ended early; the last {how}")
-    note_failure(task, failed)
-    return failed
-
-
-def _clear(task: SceneTask) -> None:
-    """Remove the partial files of a killed process, unless another process works on the scene."""
-    with claim(task.lock) as claimed:
-        if claimed:
-            remove_unfinished(task)
-
-
 def _check_and_describe(output: Path, command: Command, force: bool) -> None:
     """Write the description of the results. Raises SceneError if the output is no folder, or holds results of another
     command or other options."""
-    path, description = output / FOLDER_FILES.scenes, command.description
     if output.exists() and not output.is_dir():
         raise SceneError(f"{output}: is a file; expected the name of a folder")
+    path = output / FOLDER_FILES.scenes
+    description = {"format": SCENES_FORMAT, "command": command.name, "options": dict(command.options)}
     try:
         with claim(output / FOLDER_FILES.scenes_lock, wait=True):
-            known = _description(path)
+            try:
+                known = json.loads(read_text(path)) if path.exists() else None
+            except (ValueError, RecursionError):
+                known = "damaged"
             if known is not None and known != description and not force:
                 raise SceneError(
-                    f"{output}: holds results of {_differences(known, description)}; name another folder, or overwrite "
+                    f"{output}: holds results of {_difference(known, description)}; name another folder, or overwrite "
                     "them with --force"
                 )
             if known != description:
-                with replacing(path, named=False) as part:
-                    part.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+                write_json(description, path)
     except OSError as error:
         raise SceneError(f"{output}: cannot be used ({error.strerror or error})") from error
 
 
-def _description(path: Path) -> dict | None:
-    """The description of the results in a folder; None if there is none."""
-    try:
-        known = json.loads(read_text(path))
-    except FileNotFoundError:
-        return None
-    except (ValueError, RecursionError):
-        known = None
-    if (
-        not isinstance(known, dict)
-        or known.get("format") != SCENES_FORMAT
-        or not isinstance(known.get("options"), dict)
-    ):
-        raise SceneError(f"{path}: damaged; remove it, or name another folder")
-    return known
-
-
-def _differences(known: Mapping, wanted: Mapping) -> str:
+def _difference(known: Any, wanted: Mapping[str, Any]) -> str:
+    """How a description of results differs from the wanted one."""
+    before = known.get("options") if isinstance(known, dict) else None
+    if not isinstance(before, dict):
+        return f"unknown options, as {FOLDER_FILES.scenes} is damaged"
     if known.get("command") != wanted["command"]:
         return f"the command {known.get('command')}"
-    before, now = known["options"], wanted["options"]
+    now = wanted["options"]
     names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
     return "other options (" + ", ".join(f"{name}: {before.get(name)}, now {now.get(name)}" for name in names) + ")"
 
 
+def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -> SceneResult | None:
+    """Make the result of a task, unless it is finished. While another process works on the scene, wait for it if told
+    so, else give None. An error gives a result with the status ``failed``, and leaves no file."""
+    (task, wait), start = given, time.perf_counter()
+    try:
+        with claim(task.lock, wait) as held:
+            if not held:
+                return None
+            shutil.rmtree(task.unfinished, ignore_errors=True)  # of a killed process
+            text = json.dumps([source_file(task.source).sha256, dict(command.options)], sort_keys=True)
+            key = hashlib.sha256(text.encode()).hexdigest()
+            record = _read_record(task)
+            if record is None or not _is_as_written(task, record):
+                if os.path.lexists(task.output) and not force:
+                    raise SceneError(
+                        f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
+                        "name another folder, or overwrite it with --force"
+                    )
+                record = None
+            if record is None or record["key"] != key:
+                dense = read_scene(task.source)
+                made = command.make(dense, task.source)
+                result = _write(task, len(dense), made, {"key": key, "options": dict(command.options)}, start)
+            else:
+                result = _result_in(task, record)
+            task.lock.unlink(missing_ok=True)  # the next process to get the lock finds the scene finished
+            return result
+    except Exception as error:  # one scene must not stop the others
+        kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
+        logger.debug("%s", task.source, exc_info=True)
+        error_text = kind + one_line(error, limit=1000)  # with the paths in it
+        return task.result("failed", seconds=time.perf_counter() - start, error=error_text)
+
+
+def _write(task: SceneTask, before: int, made: SmallerScene, proofs: Mapping[str, Any], start: float) -> SceneResult:
+    """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
+    kind, unfinished = format_to_write(task.output), task.unfinished
+    unfinished.mkdir()
+    with replacing(task.output, folder=unfinished) as part:
+        if made.same and task.source.is_file() and format_to_read(task.source) is kind:
+            shutil.copyfile(task.source, part)
+        else:
+            save_as(kind, made.scene, part, name=task.output)
+        done = task.result(
+            "done",
+            before=before,
+            after=len(made.scene),
+            megabytes=part.stat().st_size / 1e6,
+            psnr=made.psnr if math.isfinite(made.psnr or 0.0) else None,
+            seconds=time.perf_counter() - start,
+            note=made.note,
+        )
+        task.output.unlink(missing_ok=True)  # an old scene must not stand beside the new record
+        facts = {name: value for name, value in dataclasses.asdict(done).items() if name not in ("name", "output")}
+        with replacing(task.record, folder=unfinished, named=False) as record:
+            record.write_text(json_text({**facts, **proofs, "sha256": content_hash(part)}) + "\n", encoding="utf-8")
+    unfinished.rmdir()
+    return done
+
+
+def _clean(task: SceneTask) -> None:
+    """Remove the unfinished files and the lock of a process that has ended, unless another works on the scene."""
+    if not task.lock.exists():
+        return
+    with suppress(OSError), claim(task.lock) as held:
+        if held:
+            shutil.rmtree(task.unfinished, ignore_errors=True)
+            task.lock.unlink(missing_ok=True)
+
+
+def _read_record(task: SceneTask) -> dict[str, Any] | None:
+    """The record of a result; None if it is missing or damaged."""
+    try:
+        record = json.loads(read_text(task.record))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict):
+        return None
+    texts = all(isinstance(record.get(name), str) for name in ("key", "sha256", "note"))
+    figures = [record.get(name) for name in ("before", "after", "megabytes", "psnr", "seconds")]
+    numbers = all(value is None or (isinstance(value, (int, float)) and abs(value) < 1e18) for value in figures)
+    return record if texts and numbers else None
+
+
+def _is_as_written(task: SceneTask, record: Mapping[str, Any]) -> bool:
+    """Whether a result is there and unchanged."""
+    return task.output.is_file() and content_hash(task.output) == record["sha256"]
+
+
+def _result_in(task: SceneTask, record: Mapping[str, Any]) -> SceneResult:
+    """The result in a record."""
+    names = ("before", "after", "megabytes", "psnr", "seconds", "note")
+    return task.result("done before", **{name: record.get(name) for name in names})
+
+
 def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping[str, SceneResult]) -> None:
     """Write the table of all scenes. Scenes of other shards are taken from their records."""
+
+    def row(task: SceneTask) -> SceneResult:
+        record = _read_record(task)
+        return task.result("open") if record is None else _result_in(task, record)
+
     with claim(output / FOLDER_FILES.scenes_lock, wait=True):  # so the last process to write has read all records
-        rows = [results.get(task.name) or known_result(task) for task in everything]
-        write_csv([dataclasses.asdict(row) for row in rows], output / FOLDER_FILES.scenes_table)
+        rows = [dataclasses.asdict(results.get(task.name) or row(task)) for task in everything]
+        write_csv(rows, output / FOLDER_FILES.scenes_table)

@@ -116,7 +116,6 @@ def prune(
     views: Views | Sampler | Callable[[], Views] | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
-    views_used: Callable[[Views], None] | None = None,
 ) -> Gaussians:
     """Prune a scene to a number of Gaussians.
 
@@ -128,7 +127,6 @@ def prune(
             a function or None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
-        views_used: called with the views that merging rendered, given or sampled; not called if it rendered none.
 
     Returns:
         Exactly the number of Gaussians that ``keep`` resolves to.
@@ -146,8 +144,6 @@ def prune(
     if method.score is None:
         merged = merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None)
         logger.debug("%s", merged.finish.note)
-        if views_used is not None and merged.views is not None:
-            views_used(merged.views)
         return merged.scene
     given = None if isinstance(views, Sampler) else views
     return scene[select(score_of(scene, method, given, opacity_weight, progress), count)]

@@ -1,4 +1,4 @@
-"""Several processes that work as one: who there is, and what they tell one another.
+"""Several processes that train one network: their ranks, and what they exchange.
 
 In a single process every function here changes nothing. The processes are those of ``torch.distributed``, started by
 ``torchrun`` or by nerfstudio, with the backend nccl on GPUs and gloo on CPUs.
@@ -10,15 +10,13 @@ import atexit
 import datetime
 import os
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
 import torch.distributed as dist
 from torch import nn
 
 from pointsplat_ns.errors import PointSplatError
-
-Result = TypeVar("Result")
 
 
 def torchrun_rank() -> tuple[int, int]:
@@ -79,38 +77,26 @@ def gathered(items: list[Any]) -> list[Any]:
     return [item for part in parts for item in part]
 
 
-def together(work: Callable[[], object]) -> None:
-    """Do this process's part of a work, and wait until all processes have done theirs.
+def by_first(work: Callable[[], object]) -> None:
+    """Let the first process do a work, while the others wait.
 
     Raises:
-        PointSplatError: if another process failed or ended; the own error if it is this one.
+        PointSplatError: in the others, if it failed or ended; the error itself in the first.
     """
     failure: Exception | None = None
+    if rank() == 0:
+        try:
+            work()
+        except Exception as error:
+            failure = error
     try:
-        work()
-    except Exception as error:
-        failure = error
-    try:
-        texts = gathered([failure and (str(failure) or type(failure).__name__)])
+        text = gathered([failure and (str(failure) or type(failure).__name__)])[0]
     except RuntimeError as error:  # of the connection
         raise failure or PointSplatError("another process ended; the same command goes on") from error
     if failure is not None:
         raise failure
-    for number, text in enumerate(texts):
-        if text:
-            raise PointSplatError(f"process {number} of {len(texts)} failed: {text}")
-
-
-def by_first(work: Callable[[], object]) -> None:
-    """Let the first process do a work, while the others wait. Errors as of :func:`together`."""
-    together(lambda: work() if rank() == 0 else None)
-
-
-def first_alone(make: Callable[[], Result]) -> Result:
-    """What ``make`` gives in each process; the first one calls it before the others, which find what it left."""
-    made: list[Result] = []
-    by_first(lambda: made.append(make()))
-    return made[0] if made else make()
+    if text:
+        raise PointSplatError(f"the first process failed: {text}")
 
 
 @torch.no_grad()

@@ -15,7 +15,6 @@ from making import ball, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.io.formats import format_like, format_to_read
 from pointsplat_ns.system.claims import claim
-from pointsplat_ns.system.processes import torchrun_rank
 
 
 def run(*args) -> None:
@@ -138,15 +137,6 @@ def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "rooms"]
 
 
-def test_only_torchrun_sets_the_part_of_a_process(monkeypatch):
-    monkeypatch.setenv("RANK", "3")  # as some schedulers do
-    monkeypatch.setenv("WORLD_SIZE", "4")
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    assert torchrun_rank() == (0, 1)
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
-    assert torchrun_rank() == (3, 4)
-
-
 INTERRUPTED = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
@@ -169,7 +159,7 @@ def test_ctrl_c_stops_all_processes_at_once_and_leaves_nothing_unfinished(folder
     while not all(lock.exists() for lock in locks):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.05)
-    (small / "..room1.ply.1.part.1.part").touch()  # as if it were written just now
+    (small / ".room1.ply.part").mkdir()  # as if it were written just now
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130 and errors.endswith("interrupted\n"), errors

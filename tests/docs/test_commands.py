@@ -11,7 +11,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from torch.distributed.run import get_args_parser as torchrun_parser
 
 import pointsplat_ns as ps
 from documented import BLOCKS, COMMANDS, NS_PROGRAMS, PAGES, ROOT, check_arguments, help_of, inline_code, start
@@ -86,10 +85,6 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
         for check in ("check_ffmpeg_installed", "check_colmap_installed"):
             monkeypatch.setattr(f"nerfstudio.utils.install_checks.{check}", lambda *_: None)
         check_arguments(words, monkeypatch, capsys)
-    elif program == "torchrun":
-        started = torchrun_parser().parse_args(words[1:])
-        assert started.no_python and started.training_script in ("pointsplat", "ns-train"), "no rule for this program"
-        check_arguments((started.training_script, *started.training_script_args), monkeypatch, capsys)
     elif program == "python" and words[1:2] == ("-m",):
         if words[2] == "pytest":
             assert all((ROOT / word).exists() for word in words[3:] if not word.startswith("-"))

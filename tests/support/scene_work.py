@@ -1,15 +1,18 @@
-"""What tests do to scenes of a folder, also in other processes."""
+"""What tests do in other processes, also to scenes of a folder."""
 
 import os
 import signal
+import time
 from pathlib import Path
 
-from pointsplat_ns.compression.scene_task import SmallerScene
-from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_scene
+import torch
+
+from pointsplat_ns.compression.scene_folder import SmallerScene
+from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.gaussians import Gaussians
 
 
-def halve(path: Path, journal: Path) -> SmallerScene:
+def halve(scene: Gaussians, path: Path, journal: Path) -> SmallerScene:
     """Every other Gaussian. A line of the journal says that it was made.
 
     A scene called ``bad...`` fails; at one called ``killed...`` its process is killed the first time, at one called
@@ -22,5 +25,12 @@ def halve(path: Path, journal: Path) -> SmallerScene:
         raise SceneError(f"{path}: is bad")
     if path.stem.startswith("deadly") or (path.stem.startswith("killed") and seen == 1):
         os.kill(os.getpid(), signal.SIGKILL)
-    scene = read_scene(path)
-    return SmallerScene(scene[::2], len(scene), 30.0)
+    return SmallerScene(scene[::2], 30.0)
+
+
+def where(seconds: float) -> tuple[int, int]:
+    """The process, and its number of threads, after some seconds."""
+    time.sleep(seconds)
+    if seconds < 0.1:
+        raise DataError("too short")
+    return os.getpid(), torch.get_num_threads()

@@ -135,11 +135,18 @@ class Merger:
         settings: MergeSettings = MERGING,
     ):
         self._scene, self._options = scene, (views, settings)
+        self.views: Views | None = None
+        """Those of the last result that has some, see :class:`Merged`."""
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
-    @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
         """The result of :func:`merge`, to the bit. Arguments and errors as there."""
+        merged = self._merged(k, progress)
+        self.views = self.views if merged.views is None else merged.views
+        return merged
+
+    @torch.no_grad()
+    def _merged(self, k: int, progress: Callable[[float], None] | None) -> Merged:
         settings = self._options[-1]
         if not self._steps and 1 <= k < len(self._scene):
             dense = self._scene.to(device="cpu")

@@ -23,7 +23,7 @@ from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.refiner.layers import BatchNorm
-from pointsplat_ns.system.processes import average_gradients, gathered
+from pointsplat_ns.system.processes import average_gradients, gathered, torchrun_rank
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -255,6 +255,15 @@ def test_batch_norm_is_that_of_all_points(together):
             torch.testing.assert_close(part[name], wanted[name], **tight)
     pair = BatchNorm(CHANNELS).double()(x[:2]).detach()
     torch.testing.assert_close(torch.cat([part["norm of a point"] for part in found]), pair, **tight)
+
+
+def test_only_torchrun_sets_the_part_of_a_process(monkeypatch):
+    monkeypatch.setenv("RANK", "3")  # as some schedulers do
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    assert torchrun_rank() == (0, 1)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    assert torchrun_rank() == (3, 4)
 
 
 def test_ns_train_under_torchrun_is_one_training(tmp_path):

@@ -1,20 +1,21 @@
 """The steps that merge a scene cell by cell.
 
-Under ``torchrun`` a cell is merged by the process whose turn it is. Files hold all that passes between processes.
+Several processes may share the cells. Files hold all that passes between them.
 """
 
 from __future__ import annotations
 
 import functools
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import BudgetError
+from pointsplat_ns.errors import BudgetError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
@@ -35,10 +36,10 @@ from pointsplat_ns.pruning.merging.replacement import replace_pairs
 from pointsplat_ns.pruning.merging.rounds import merge
 from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.pruning.merging.state import State, initial_state
-from pointsplat_ns.system.processes import by_first, first_alone, rank, together, world_size
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
+from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.views import Views
 
 _OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
@@ -56,9 +57,9 @@ def merge_file(
     sampler: Callable[[Gaussians], Sampler] = Sampler,
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
+    jobs: int = 1,
 ) -> tuple[int, int]:
-    """Merge the Gaussians of a file, and write those that remain, cell by cell. Connected processes share the cells:
-    each calls this with a scratch of the same folder, and the first one writes the output.
+    """Merge the Gaussians of a file, and write those that remain, cell by cell.
 
     Args:
         rows: the Gaussians. Those that cannot be drawn are dropped.
@@ -70,6 +71,7 @@ def merge_file(
         sampler: from Gaussians of the scene to the sampler of their views.
         progress: called with what is being done, and the share done of it.
         settings: the tuned numbers.
+        jobs: number of processes that share the cells. The result is the same to the bit.
 
     Returns:
         The numbers of Gaussians before and after.
@@ -77,9 +79,9 @@ def merge_file(
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
         BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that remain.
-        PointSplatError: if another process fails.
+        PointSplatError: if processes are killed.
     """
-    cells = first_alone(lambda: divided(rows, most, scratch, functools.partial(progress, "dividing into cells")))
+    cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
     k = count_of(cells.count)
     if k < len(cells):
         raise BudgetError(
@@ -91,70 +93,60 @@ def merge_file(
         with one_thread_each():
             return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
 
-    overview = Overview(**first_alone(lambda: scratch.tensors("overview", look)))
-    work = _Work(cells, overview, k, sampler, settings, progress)
-    rounds = work.merged()
-    together(lambda: work.finish(rounds))
+    work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
+    with Workers(work, jobs) as workers:
 
-    def join() -> None:
-        with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
-            stream.write(header_bytes(k, rows.sh_degree, rows.traits))
-            for cell in range(len(cells)):
-                with work.finished(cell).open("rb") as finished:
-                    shutil.copyfileobj(finished, stream, 1 << 20)
+        def each(what: str, step: Callable[..., None], *args: object) -> None:
+            """Take a step of every cell."""
+            progress(what, 0.0)
+            steps = [(step, cell, *args) for cell in range(len(cells))]
+            for done, (_, killed) in enumerate(workers.results(steps), 1):
+                if killed is not None:
+                    raise PointSplatError(f"{what}: {killed}; the same command goes on, with fewer --jobs if need be")
+                progress(what, done / len(cells))
 
-    by_first(join)
+        rounds, left = 0, -1
+        while left != k:
+            chosen = _chosen(rounds)
+            if not scratch.has(chosen):
+                each(f"merging, round {rounds + 1}", _Work.find, rounds)
+            left = int(scratch.tensors(chosen, functools.partial(work.choose, rounds))["left"])
+            rounds += 1
+        changes = [scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))]
+        each("finishing", _Work.finish, rounds, float(torch.cat(changes).mean()))
+    with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
+        stream.write(header_bytes(k, rows.sh_degree, rows.traits))
+        for cell in range(len(cells)):
+            with (scratch.folder / _finished(cell)).open("rb") as finished:
+                shutil.copyfileobj(finished, stream, 1 << 20)
     return cells.count, k
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """The steps, whose results are kept."""
+    """The steps, whose results are kept. Called with one of its functions and their arguments, in any process."""
 
     cells: Cells
     overview: Overview
     k: int
     sampler: Callable[[Gaussians], Sampler]
     settings: MergeSettings
-    progress: Progress
 
-    def merged(self) -> int:
-        """Choose pairs until ``k`` Gaussians remain, and return the number of rounds."""
-        number, left = 0, -1
-        while left != self.k:
-            together(functools.partial(self._find, number))
-            choose = functools.partial(self._choose, number)
-            chosen = first_alone(functools.partial(self.cells.scratch.tensors, _chosen(number), choose))
-            number, left = number + 1, int(chosen["left"])
-        return number
+    def __call__(self, step: tuple[Any, ...]) -> None:
+        function, *args = step
+        function(self, *args)
 
-    def finish(self, rounds: int) -> None:
-        """Write the rows of the own cells after so many rounds."""
+    def find(self, cell: int, number: int) -> None:
+        """Find the pairs of a cell that may be merged in a round."""
         scratch = self.cells.scratch
-        changes = [scratch.known(_sizes(cell))["changes"] for cell in range(len(self.cells))]
-        change = float(torch.cat(changes).mean())
-        for cell in self._own("finishing"):
-            scratch.file(_finished(cell), functools.partial(self._write, rounds, cell, change))
+        scratch.make(_round(number, cell), functools.partial(self._round, number, cell))
+        scratch.drop(_round(number - 2, cell))
 
-    def finished(self, cell: int) -> Path:
-        """The file of the rows of a cell."""
-        return self.cells.scratch.folder / _finished(cell)
+    def finish(self, cell: int, rounds: int, size_change: float) -> None:
+        """Write the rows of a cell after so many rounds."""
+        self.cells.scratch.file(_finished(cell), functools.partial(self._write, rounds, cell, size_change))
 
-    def _own(self, what: str) -> Iterator[int]:
-        """The cells of this process; tells how far it is with ``what``."""
-        own = range(rank(), len(self.cells), world_size())
-        for done, cell in enumerate(own):
-            self.progress(what, done / len(own))
-            yield cell
-
-    def _find(self, number: int) -> None:
-        """Find the pairs of the own cells that may be merged in a round, unless it has been chosen of them."""
-        scratch = self.cells.scratch
-        for cell in () if scratch.has(_chosen(number)) else self._own(f"merging, round {number + 1}"):
-            scratch.make(_round(number, cell), functools.partial(self._round, number, cell))
-            scratch.drop(_round(number - 2, cell))
-
-    def _choose(self, number: int) -> dict[str, Tensor]:
+    def choose(self, number: int) -> dict[str, Tensor]:
         """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
         ``left`` then."""
         left, prices = 0, []

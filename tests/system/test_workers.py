@@ -1,0 +1,32 @@
+"""Processes that share work: threads, errors, and their end."""
+
+import os
+
+import psutil
+import pytest
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.system.cores import cores
+from pointsplat_ns.system.workers import Workers, check_jobs
+from scene_work import where
+
+
+def test_processes_share_the_cores_pass_errors_on_and_end_with_the_context(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    before = torch.get_num_threads()
+    with Workers(where, 2) as workers:
+        found = dict(workers.results([0.5, 0.6, 0.7]))
+        assert {threads for _, threads in found.values()} == {max(1, cores() // 2)}
+        with pytest.raises(DataError, match="too short"):
+            list(workers.results([600.0, 0.0]))
+    assert torch.get_num_threads() == before and "OMP_NUM_THREADS" not in os.environ
+    assert os.getpid() not in {pid for pid, _ in found.values()}
+    assert not any(psutil.pid_exists(pid) for pid, _ in found.values())
+
+
+def test_one_job_is_done_in_this_process_and_none_is_refused():
+    with Workers(where, 1) as workers:
+        assert list(workers.results([0.1])) == [(0.1, (os.getpid(), torch.get_num_threads()))]
+    with pytest.raises(DataError, match="jobs is 0; expected 1 or more"):
+        check_jobs(0)
