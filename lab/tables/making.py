@@ -19,9 +19,9 @@ from typing import Any
 
 from torch import Tensor
 
+from lab.tables.fine_tune import fine_tune
 from lab.tables.scene import OpenedScene, TableOptions
 from lab.tables.ways import PROTOCOL, WAYS, Network, Way
-from pointsplat_ns.compression.fine_tune import fine_tune
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply

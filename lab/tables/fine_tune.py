@@ -20,9 +20,8 @@ def fine_tune(
     views: Views,
     targets: Gaussians | Sequence[Tensor],
     steps: int,
-    rates: dict[str, float] | None = None,
-    seed: int = 0,
-    progress: Callable[[float], None] | None = None,
+    seed: int,
+    progress: Callable[[float], None],
 ) -> Gaussians:
     """Optimise the parameters of a scene so that its renders match target images. The number of Gaussians is kept.
 
@@ -34,8 +33,6 @@ def fine_tune(
         views: C views.
         targets: the dense scene, whose renders are the targets; or C images (H, W, 3) in [0, 1], one per view.
         steps: number of optimisation steps.
-        rates: learning rates by parameter name, in place of those of 3DGS. The rate of the means is multiplied by the
-            extent of the scene.
         seed: seed of the order of the views.
         progress: called with the share done, in [0, 1].
 
@@ -50,12 +47,10 @@ def fine_tune(
     if not isinstance(targets, Gaussians) and len(targets) != len(views):
         raise DataError(f"{len(targets)} pictures for {len(views)} views; expected one each")
     scene = scene.map(lambda value: value.detach().clone())
-    adam = Adam(scene, AdamSettings(), {**RATES, **(rates or {})})
-    scenes = optimised(scene, adam, _examples(views, targets, scene, seed))
+    scenes = optimised(scene, Adam(scene, AdamSettings(), RATES), _examples(views, targets, scene, seed))
     for step in range(steps):
         scene = next(scenes)
-        if progress is not None:
-            progress((step + 1) / steps)
+        progress((step + 1) / steps)
     return scene
 
 
