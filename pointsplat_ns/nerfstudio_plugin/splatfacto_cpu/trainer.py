@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -25,7 +24,6 @@ from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
 from pointsplat_ns.system.tensors import FLOATS
@@ -114,7 +112,7 @@ class CheckingOptimizers(Optimizers):
 
 
 class SplatfactoCpuTrainer(StoppableTrainer):
-    """nerfstudio's trainer, which can be stopped at any time and tells early how long it takes and what comes of it.
+    """nerfstudio's trainer, which can be stopped at any time and skips steps that are not finite.
 
     A step whose loss or gradients are not finite changes neither parameters nor the optimisers' state nor what
     densification gathers. It is counted, and the log names its photo. The learning-rate schedules still advance.
@@ -135,17 +133,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         if self.config.max_skipped_in_a_row < 0:
             raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
         super().setup(test_mode)
-        if self.config.early_look and test_mode == "val":
-            pictures = self.base_dir / "pictures"
-            look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
-
-            def after_training(step: int) -> None:
-                with self.train_lock:  # as nerfstudio holds it in a step: the viewer's threads draw with the same model
-                    look.after_training(step)
-
-            before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
-            self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
-            self.callbacks.append(TrainingCallback([after], after_training, update_every_num_iters=1))
 
     def train(self) -> None:
         """As nerfstudio's."""
