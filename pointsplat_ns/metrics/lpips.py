@@ -68,13 +68,12 @@ class Lpips(nn.Module):
         super().__init__()
         self.net = net
         self.network = empty_network(net)
-        layers = self.network.net
-        weights = {  # slice2.5.weight is torchvision's features.5.weight
-            name: _expect(backbone, f"features.{name.partition('.')[2]}", tuple(empty.shape))
-            for name, empty in layers.state_dict().items()
+        weights = {  # net.slice2.5.weight is torchvision's features.5.weight
+            name: _expect(backbone, f"features.{name.split('.', 2)[2]}", tuple(empty.shape))
+            for name, empty in self.network.state_dict().items()
+            if name.startswith("net.")
         }
-        layers.load_state_dict(weights, assign=True)
-        self.network.load_state_dict(linear, strict=False, assign=True)
+        self.network.load_state_dict({**weights, **linear}, strict=False, assign=True)
         self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:

@@ -27,10 +27,12 @@ NETS = ["alex", "vgg"]
 def random_backbone(net, seed=0):
     generator = torch.Generator().manual_seed(seed)
     state = {}
-    for name, empty in empty_network(net).net.state_dict().items():
+    for name, empty in empty_network(net).state_dict().items():
+        if not name.startswith("net."):
+            continue
         # He's initialisation keeps the activations of one size through all layers.
         spread = math.sqrt(2 / empty[0].numel()) if name.endswith("weight") else 0.1
-        state[f"features.{name.partition('.')[2]}"] = spread * torch.randn(empty.shape, generator=generator)
+        state[f"features.{name.split('.', 2)[2]}"] = spread * torch.randn(empty.shape, generator=generator)
     return state
 
 
