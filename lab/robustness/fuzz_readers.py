@@ -316,5 +316,4 @@ READERS |= {
     "colmap-images-text": at("images.txt", _poses_in_folder, _colmap("txt")),
     "trajectory": at("traj.txt", _use_replica, _replica),
     "intrinsics": at("cam_params.json", _use_replica, _replica),
-    "held-out-list": at("list.txt", "pointsplat_ns.nerfstudio_plugin.replica.dataparser:read_eval_list"),
 }

@@ -1,6 +1,5 @@
 """Posed photos loaded when due, and what is kept of them in memory."""
 
-import json
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
@@ -173,22 +171,6 @@ def test_a_lens_that_cannot_be_undone_is_named(tmp_path):
         make_dataset(tmp_path, distortion=[0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
     with pytest.raises(DataError, match="photo0.png.*Only perspective and fisheye"):
         make_dataset(tmp_path, camera_type=CameraType.EQUIRECTANGULAR)
-
-
-def test_a_dataparser_that_loses_the_pose_of_a_single_photo_is_refused(tmp_path):
-    make_dataset(tmp_path)
-    pose = np.eye(4).tolist()
-    frames = [{"file_path": f"photo{i}.png", "transform_matrix": pose} for i in range(5)]
-    meta = {"fl_x": 35.0, "fl_y": 36.0, "w": WIDTH, "h": HEIGHT, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-
-    def dataset(held_out: int) -> UndistortedDataset:
-        parser = InstantNGPDataParserConfig(data=tmp_path, train_split_fraction=1 - held_out / 5).setup()
-        return UndistortedDataset(parser.get_dataparser_outputs("test"))
-
-    with pytest.raises(DataError, match=r"photo3.png: .* shape \(4, 3\) .* expected \(1, 3, 4\); .* hold out two"):
-        dataset(1)
-    assert len(dataset(2).cameras) == 2
 
 
 @pytest.mark.parametrize(("times", "count"), [([0.0, 0.5, 1.0, 0.5, 0.0], 3), ([0.0, 0.0, 0.0, 0.0, float("nan")], 2)])
