@@ -304,7 +304,6 @@ def _use_replica(path: Path) -> object:
 
 READERS |= {
     "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
-    "pruned-scene": at("a.safetensors", "pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes:read_pruned"),
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),

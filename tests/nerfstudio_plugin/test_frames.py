@@ -1,7 +1,6 @@
 """Posed photos loaded when due, and what is kept of them in memory."""
 
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, Frames, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 WIDTH, HEIGHT = 40, 30
@@ -220,11 +219,6 @@ def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
         UndistortedDataset(outputs)
 
 
-@dataclass(frozen=True)
-class Name(CacheKey[str]):
-    number: int
-
-
 def test_the_bound_holds_while_many_threads_put_and_get():
     cache = MemoryCache(10)
     above, wrong = [], []
@@ -232,10 +226,10 @@ def test_the_bound_holds_while_many_threads_put_and_get():
     def work(seed):
         for step in range(300):
             number = (7 * step + seed) % 12
-            cache.put(Name(number), str(number), 1 + number % 4)
+            cache.put(number, str(number), 1 + number % 4)
             if cache.num_bytes > cache.max_bytes:
                 above.append(cache.num_bytes)
-            if cache.get(Name(number)) not in (None, str(number)):
+            if cache.get(number) not in (None, str(number)):
                 wrong.append(number)
 
     threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]

@@ -22,35 +22,18 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
-from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
 """The training photos of a dataset, or its held-out ones."""
-
-
-@dataclass(frozen=True)
-class DenseKey(CacheKey[Gaussians]):
-    """Key of a scene's Gaussians in a cache that several scenes share."""
-
-    scene: str
-
-
-@dataclass(frozen=True)
-class RenderKey(CacheKey[tuple[Cameras, dict[str, Any]]]):
-    """Key of a scene's render in a cache that several scenes share."""
-
-    scene: str
-    split: Split
-    index: int
 
 
 @dataclass(frozen=True)
@@ -96,11 +79,6 @@ class DenseScene:
         folder is moved, and changes if the scene is trained again."""
         raise NotImplementedError
 
-    @cached_property
-    def content(self) -> str:
-        """SHA-256 of the file that holds the Gaussians. Pruned scenes on disk are found by it."""
-        return content_hash(self.source)
-
     @property
     def rasterize_mode(self) -> RasterizeMode:
         """Rasterize mode that the scene is rendered with."""
@@ -117,11 +95,12 @@ class DenseScene:
 
     def dense(self, keep: bool) -> Gaussians:
         """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""
-        dense = self.cache.get(DenseKey(self.name))
+        key = "dense", self.name
+        dense = self.cache.get(key)
         if dense is None:
             dense = self.read_dense()
             if keep:
-                self.cache.put(DenseKey(self.name), dense, sum(value.nbytes for value in dense.tensors()))
+                self.cache.put(key, dense, sum(value.nbytes for value in dense.tensors()))
         return dense
 
     def cameras(self, split: Split) -> Cameras:
@@ -208,7 +187,7 @@ class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         index %= len(self)
-        key = RenderKey(self._scene.name, self._split, index)
+        key = "render", self._scene.name, self._split, index
         frame = self._scene.cache.get(key)
         if frame is None:
             camera = self.cameras[index : index + 1]

@@ -160,7 +160,6 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     assert manager.eval_scenes == tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     assert (manager.supervision, manager.seed) == ("dense", 3)
     assert model.keep == RECIPE.keep and model.size == "tiny" and model.by == "merge"
-    assert model.pruned_folder == Path("o/pruned")
 
 
 LPIPS_WEIGHTS = SHARED_DATA / "weights"
