@@ -17,8 +17,6 @@ import torch
 from cachetools import LRUCache
 from nerfstudio.cameras.cameras import Cameras
 
-from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
-
 
 def free_memory_share(share: float = 0.25) -> int:
     """Bytes in a share of the memory that is available now."""
@@ -62,7 +60,9 @@ Frame = tuple[Cameras, dict[str, Any]]
 
 
 class Frames:
-    """The posed photos of one split of a dataset.
+    """The posed photos of one split of a dataset: an
+    :class:`~pointsplat_ns.nerfstudio_plugin.undistorted.UndistortedDataset`, or another with ``cameras``, a length and
+    ``get_data``.
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
@@ -77,7 +77,7 @@ class Frames:
 
     def __init__(
         self,
-        dataset: UndistortedDataset,
+        dataset: Any,
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
         max_workers: int = 2,

@@ -99,23 +99,12 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         }
 
     def check(self) -> None:
-        """Raise a PointSplatError for settings that fit no scene, and for options that would have no effect."""
+        """Raise a PointSplatError for settings that fit no scene."""
         for keep in (self.keep, *self.more_keeps):
             self.prune_settings(keep)
         if not 0 <= self.lpips_weight < math.inf:  # NaN fails too
             raise PointSplatError(
                 f"--pipeline.model.lpips-weight {self.lpips_weight:g}: expected a finite number, 0 or above"
-            )
-        if self.lpips_weight == 0 and self.lpips_net != "auto":
-            raise PointSplatError(
-                f"--pipeline.model.lpips-net {self.lpips_net}: at --pipeline.model.lpips-weight 0 the loss has no "
-                "LPIPS; give a weight above 0, or leave the network out"
-            )
-        if self.backend == "gsplat" and (self.compiled or self.quality != "exact"):
-            option = "compiled True" if self.compiled else f"quality {self.quality}"
-            raise PointSplatError(
-                f"--pipeline.model.{option}: has no effect on --pipeline.model.backend gsplat; leave it out, or take "
-                "the backend torch or auto"
             )
 
 
