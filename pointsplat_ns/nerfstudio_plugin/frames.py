@@ -51,9 +51,6 @@ class MemoryCache:
             if num_bytes <= self.max_bytes:
                 self._entries[key] = value, num_bytes
 
-    def __len__(self) -> int:
-        return len(self._entries)
-
 
 Frame = tuple[Cameras, dict[str, Any]]
 """A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""

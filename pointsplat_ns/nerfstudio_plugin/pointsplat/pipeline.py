@@ -55,7 +55,7 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 class PointSplatPipeline(VanillaPipeline):
     """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
-    ``--data`` holds no scene, or ``world_size`` processes are not connected."""
+    ``--data`` holds no scene, ``world_size`` processes are not connected, or several share a network with batch norm."""
 
     datamanager: ScenesDataManager
     config: PointSplatPipelineConfig
@@ -75,6 +75,11 @@ class PointSplatPipeline(VanillaPipeline):
                 f"{world_size} processes are asked for and {processes.world_size()} are connected; start them with "
                 "torchrun, or, on GPUs, by ns-train --machine.num-devices"
             )
+        if world_size > 1 and config.model.norm == "batch":
+            raise SceneError(
+                "--pipeline.model.norm batch: its statistics are of the scenes of one process; expected scene or layer "
+                "where several processes train together"
+            )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
@@ -87,8 +92,6 @@ class PointSplatPipeline(VanillaPipeline):
         manager = self.datamanager
         self.model.attach(manager.scenes, manager.shown, manager.cache, manager.background)
         processes.share_state(self.model.refiner)
-        if world_size > 1:
-            distributed.synchronise_batch_norm(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
         self.training_state = TrainingState(self.model.get_param_groups(), trained_on)

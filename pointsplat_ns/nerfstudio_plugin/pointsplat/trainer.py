@@ -75,9 +75,9 @@ class PointSplatTrainer(StoppableTrainer):
     """nerfstudio's trainer, with averaged gradients, that skips steps whose loss or gradients are not finite.
 
     If a loss or a gradient is NaN or infinite in any process, all processes skip the step: it changes neither
-    parameters nor the optimisers' state nor running statistics. (With synchronised batch norm a NaN in one process
-    spreads to all.) The step is logged with its scene, counted, and left out of the mean of accumulated gradients. The
-    learning-rate schedule still advances, as it counts the steps of the run.
+    parameters nor the optimisers' state nor running statistics. The step is logged with its scene, counted,
+    and left out of the mean of accumulated gradients. The learning-rate schedule still advances, as it counts the steps
+    of the run.
 
     A checkpoint between two updates holds the gradients accumulated so far. Checkpoints also come every
     :data:`SECONDS_BETWEEN_CHECKPOINTS`.

@@ -20,15 +20,13 @@ from pointsplat_ns.compression import feedback_training
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
-from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
+from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.refiner.layers import BatchNorm
 from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
 UPDATES = 2
-ROWS, CHANNELS = 10, 4
 BROKEN = {3}, {6}
 """Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
 
@@ -100,16 +98,6 @@ def timed(rooms: Path, folder: Path, rank: int) -> dict:
         return train(config, world_size=2)
 
 
-def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Two steps of a batch norm in training, the gradients of a weighted sum of what comes out, and its statistics."""
-    x = x.clone().requires_grad_()
-    norm(2 * x.detach())
-    out = norm(x)
-    (out * weights).sum().backward()
-    found = {"out": out.detach(), "x": x.grad, "weight": norm.weight.grad, "bias": norm.bias.grad}
-    return found | {name: value.clone() for name, value in norm.named_buffers()}
-
-
 def feedback(file: Path) -> list[torch.Tensor]:
     """What the network that sets the steps of repairs learns in two updates of two repairs."""
     settings = feedback_training.FeedbackTrainingSettings(steps=(6,))
@@ -119,13 +107,6 @@ def feedback(file: Path) -> list[torch.Tensor]:
     return [value.detach() for value in network.parameters()]
 
 
-def rows() -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of two scenes of different sizes, far from zero, and weights for the loss."""
-    generator = torch.Generator().manual_seed(7)
-    x = torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64) + 100
-    return x, torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64)
-
-
 def work(rank: int, folder: Path) -> None:
     """What each of the two processes does."""
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
@@ -133,12 +114,6 @@ def work(rank: int, folder: Path) -> None:
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
         found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank)
     found["timed"] = timed(folder / "rooms", folder, rank)
-    x, weights = rows()
-    mine = slice(0, 3) if rank == 0 else slice(3, ROWS)
-    norm = nn.Sequential(BatchNorm(CHANNELS).double())
-    synchronise_batch_norm(norm)
-    found["norm"] = normalise(norm[0], x[mine], weights[mine])
-    found["norm of a point"] = norm[0](x[rank : rank + 1]).detach()
     found["gathered"] = gathered([rank, "x"])
     found["means"] = means_over_ranks({"l1": torch.tensor(1.0 + rank), "only": torch.tensor(5.0)}, ("l1", "lpips"))
     one, none = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3))
@@ -239,24 +214,6 @@ def test_the_first_process_says_when_the_time_is_over(together):
     assert f"step-{2:09d}.ckpt" in ours["files"]
 
 
-def test_batch_norm_is_that_of_all_points(together):
-    found, _ = together
-    x, weights = rows()
-    # each process's loss is its own; the mean of their gradients is that of the mean loss
-    wanted = normalise(BatchNorm(CHANNELS).double(), x, weights)
-    parts = [part["norm"] for part in found]
-    tight = {"rtol": 1e-9, "atol": 1e-9}  # float64
-    for name in ("out", "x"):
-        torch.testing.assert_close(torch.cat([part[name] for part in parts]), wanted[name], **tight)
-    for name in ("weight", "bias"):
-        torch.testing.assert_close(parts[0][name] + parts[1][name], wanted[name], **tight)
-    for part in parts:
-        for name in ("running_mean", "running_var", "num_batches_tracked"):
-            torch.testing.assert_close(part[name], wanted[name], **tight)
-    pair = BatchNorm(CHANNELS).double()(x[:2]).detach()
-    torch.testing.assert_close(torch.cat([part["norm of a point"] for part in found]), pair, **tight)
-
-
 def test_ns_train_under_torchrun_is_one_training(tmp_path):
     write_rooms(tmp_path / "rooms")
     asked = [
@@ -283,6 +240,12 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
     with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
         config.set_timestamp()
     with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
+        config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
+    config.pipeline.model.norm = "batch"
+    with (
+        mock.patch("pointsplat_ns.system.processes.world_size", return_value=2),
+        pytest.raises(SceneError, match="--pipeline.model.norm batch: .*expected scene or layer"),
+    ):
         config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
 
 
