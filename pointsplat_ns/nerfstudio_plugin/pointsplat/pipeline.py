@@ -55,7 +55,7 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 class PointSplatPipeline(VanillaPipeline):
     """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
-    ``--data`` holds no scene, ``world_size`` processes are not connected, or several share a network with batch norm."""
+    ``--data`` holds no scene, ``world_size`` processes are not connected, or several share batch norm."""
 
     datamanager: ScenesDataManager
     config: PointSplatPipelineConfig
