@@ -18,11 +18,6 @@ from cachetools import LRUCache
 from nerfstudio.cameras.cameras import Cameras
 
 
-def free_memory_share(share: float = 0.25) -> int:
-    """Bytes in a share of the memory that is available now."""
-    return int(share * psutil.virtual_memory().available)
-
-
 class MemoryCache:
     """A least-recently-used cache for values of several kinds, which their keys tell apart, bounded in bytes; a bound
     of 0 keeps nothing. Safe to share among threads. Values are not copied: do not write to them."""
@@ -31,6 +26,11 @@ class MemoryCache:
         self.max_bytes = max_bytes
         self._entries: LRUCache[Hashable, tuple[Any, int]] = LRUCache(max_bytes, getsizeof=lambda entry: entry[1])
         self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, gigabytes: float | None = None) -> MemoryCache:
+        """A cache of this size, 10^9 bytes; by default of a quarter of the memory that is free now."""
+        return cls(psutil.virtual_memory().available // 4 if gigabytes is None else int(gigabytes * 1e9))
 
     @property
     def num_bytes(self) -> int:
@@ -81,7 +81,7 @@ class Frames:
     ):
         self.dataset = dataset
         self.image_type: Literal["uint8", "float32"] = image_type
-        self.cache = MemoryCache(free_memory_share()) if cache is None else cache
+        self.cache = MemoryCache.of() if cache is None else cache
         self._owner = object()
         self._max_workers = max_workers
         self._pool: ThreadPoolExecutor | None = None

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
@@ -31,6 +31,10 @@ from pointsplat_ns.system.tensors import FLOATS
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
+
+MOST_SKIPPED_IN_A_ROW = 10
+"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
+and names the photos. One broken photo among sound ones stops nothing."""
 
 _LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
 """Attributes of the datamanager: the frames that are still to come before any is repeated."""
@@ -127,13 +131,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         """Number of steps that were skipped, by photo."""
         self._skipped_in_a_row = 0
 
-    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's. Raises PointSplatError if the data cannot be used, or ``max_skipped_in_a_row`` is
-        negative."""
-        if self.config.max_skipped_in_a_row < 0:
-            raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
-        super().setup(test_mode)
-
     def train(self) -> None:
         """As nerfstudio's."""
         with tiny_as_zero():
@@ -145,11 +142,11 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """As nerfstudio's, but skips a step whose loss or gradients are not finite. If more than
-        ``max_skipped_in_a_row`` have been skipped without one between that was not, a checkpoint is saved, and a
+        :data:`MOST_SKIPPED_IN_A_ROW` have been skipped without one between that was not, a checkpoint is saved, and a
         DataError ends training."""
         loss, losses, metrics = super().one_step(step)
         metrics["skipped_steps"] = self.skipped.total()
-        if self._skipped_in_a_row > self.config.max_skipped_in_a_row:
+        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
             self._stop(step)
         return loss, losses, metrics
 
