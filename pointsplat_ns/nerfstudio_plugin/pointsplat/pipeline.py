@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +28,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
@@ -51,6 +51,18 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: PointSplatPipeline)
     datamanager: ScenesDataManagerConfig = field(default_factory=ScenesDataManagerConfig)
     model: PointSplatModelConfig = field(default_factory=PointSplatModelConfig)
+
+
+@dataclass
+class TrainingState:
+    """The state of a training that checkpoints hold beside weights and optimisers."""
+
+    trained_on: set[str]
+    """Identities of the scenes that the network has been trained on, also before it was resumed."""
+    seconds: float = 0.0
+    """Duration of the training so far, also before it was resumed."""
+    skipped: Counter[str] = field(default_factory=Counter)
+    """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
 
 
 class PointSplatPipeline(VanillaPipeline):
@@ -94,17 +106,22 @@ class PointSplatPipeline(VanillaPipeline):
         processes.share_state(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
-        self.training_state = TrainingState(self.model.get_param_groups(), trained_on)
+        self.training_state = TrainingState(set(trained_on))
         """State of the training that checkpoints hold beside weights and optimisers."""
 
     def get_extra_state(self) -> dict[str, Any]:
         """The training state, for torch's ``state_dict``."""
-        return self.training_state.to_dict()
+        state = self.training_state
+        return {"trained_on": sorted(state.trained_on), "skipped": dict(state.skipped), "seconds": state.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Load the training state of a checkpoint; logs which of its scenes are missing now."""
-        scenes = self.datamanager.scenes
-        self.training_state.load(state, [scene.name for scene in scenes])
+        """Load the training state of a checkpoint; logs which of its scenes are missing now. The counts of skipped
+        steps of these are dropped."""
+        scenes, ours = self.datamanager.scenes, self.training_state
+        there = {scene.name for scene in scenes}
+        ours.seconds = state.get("seconds", 0.0)
+        ours.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
+        ours.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
         if gone:
             CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
