@@ -85,7 +85,7 @@ class PointSplatTrainer(StoppableTrainer):
         self._last_step = sys.maxsize
 
     def setup_optimizers(self) -> AveragingOptimizers:
-        """The optimisers. Raises PointSplatError if ``max_skipped_steps`` is negative or ``seconds`` is not positive."""
+        """The optimisers. Raises PointSplatError if ``max_skipped_steps`` or ``seconds`` are out of range."""
         if self.config.max_skipped_steps < 0:
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
         if self.config.seconds is not None and not 0 < self.config.seconds < math.inf:  # NaN fails too
