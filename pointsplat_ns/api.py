@@ -105,7 +105,6 @@ def prune(
     sh: str = "all",
     opacity_weight: float | None = None,
     clean: bool = False,
-    fine_tune: int = 0,
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
@@ -128,7 +127,6 @@ def prune(
             40 dB.
         opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
         clean: first remove Gaussians that cannot be drawn or seen; ``keep`` refers to the scene as given.
-        fine_tune: number of optimisation steps of the result against renders of the given scene.
         views: cameras for all rendering: views, the run whose dataset has the poses, or a file of cameras
             (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By
             default those of the run at ``scene``, or sampled poses.
@@ -154,7 +152,7 @@ def prune(
         >>> len(ps.prune(room, keep=1000)), round(len(ps.prune(room, keep="10%", by="coverage")) / len(room), 2)
         (1000, 0.1)
     """
-    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune)
+    request = PruneRequest(keep, by, sh, opacity_weight, clean)
     _, pruned, _, _ = prune_source(scene, request, views, resolution, up, data, progress)
     return pruned
 

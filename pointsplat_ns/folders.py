@@ -143,7 +143,6 @@ def prune_folder(
     sh: str = "all",
     opacity_weight: float | None = None,
     clean: bool = False,
-    fine_tune: int = 0,
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
     jobs: int = 1,
@@ -152,14 +151,13 @@ def prune_folder(
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
     """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
-    request, size = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune), parse_resolution(resolution)
+    request, size = PruneRequest(keep, by, sh, opacity_weight, clean), parse_resolution(resolution)
     options: CommandOptions = {
         "keep": str(request.budget),
         "by": by,
         "sh": sh,
         "opacity_weight": opacity_weight,
         "clean": clean,
-        "fine_tune": fine_tune,
         "resolution": None if size is None else size_text(size),
         **({} if data is None else {"data": str(data)}),
     }

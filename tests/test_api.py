@@ -113,13 +113,13 @@ def test_views_may_be_those_of_a_run(scene, trained_walls, caplog):
 
 @pytest.mark.parametrize(
     "options",
-    [{"by": "best"}, {"by": "merge", "opacity_weight": 0.5}, {"keep": "half"}, {"sh": "4"}, {"fine_tune": -1}],
+    [{"by": "best"}, {"by": "merge", "opacity_weight": 0.5}, {"keep": "half"}, {"sh": "4"}],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, tmp_path):
     with pytest.raises(ps.PointSplatError) as caught:
         ps.prune(tmp_path / "gone.ply", **options)
     assert "gone.ply" not in str(caught.value)
-    if not {"opacity_weight", "fine_tune"} & set(options):
+    if "opacity_weight" not in options:
         with pytest.raises(ps.PointSplatError) as caught:
             ps.compact(tmp_path / "gone.ply", **options)
         assert "gone.ply" not in str(caught.value)
@@ -172,10 +172,7 @@ def saved(scene: ps.Gaussians, folder: Path) -> bytes:
         ),
         (("--keep", "0.01MB", "--sh", "auto"), {"keep": "0.01MB", "sh": "auto"}),
         (("--keep", "auto:20", "--by", "coverage"), {"keep": "auto:20", "by": "coverage"}),
-        (
-            ("--keep", "20%", "--by", "area", "--fine-tune", "2", "--clean"),
-            {"keep": 0.2, "by": "area", "fine_tune": 2, "clean": True},
-        ),
+        (("--keep", "20%", "--by", "area", "--clean"), {"keep": 0.2, "by": "area", "clean": True}),
     ],
 )
 def test_pointsplat_prune_writes_what_prune_gives(arguments, options, ply, tmp_path):

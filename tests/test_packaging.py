@@ -197,7 +197,7 @@ def test_the_core_never_imports_nerfstudio_nor_what_only_pictures_need(tmp_path)
 import pointsplat_ns as ps
 scene = ps.load({str(tmp_path / "room.ply")!r})
 small = ps.prune(scene, 0.2)
-ps.prune(scene, 0.2, "pup", sh="auto", fine_tune=1, views=ps.sample_views(scene, 2, 32, 24))
+ps.prune(scene, 0.2, "pup", sh="auto", views=ps.sample_views(scene, 2, 32, 24))
 refined = ps.refine(small)
 views = ps.sample_views(scene, 2, 32, 24)
 ps.psnr(ps.render(refined, views[0]), ps.render(scene, views[0]))

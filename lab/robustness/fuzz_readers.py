@@ -298,7 +298,6 @@ def _use_replica(path: Path) -> object:
 READERS |= {
     "refiner-metadata": _refiner_metadata,
     "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
-    "pruned-scene": at("a.safetensors", "pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes:read_pruned"),
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),
@@ -310,5 +309,4 @@ READERS |= {
     "colmap-images-text": at("images.txt", _poses_in_folder, _colmap("txt")),
     "trajectory": at("traj.txt", _use_replica, _replica),
     "intrinsics": at("cam_params.json", _use_replica, _replica),
-    "held-out-list": at("list.txt", "pointsplat_ns.nerfstudio_plugin.replica.dataparser:read_eval_list"),
 }

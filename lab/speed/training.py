@@ -54,7 +54,6 @@ WARM_UP = 2
 def _trainer(run: Path, folder: Path) -> Any:
     """nerfstudio's trainer of the run's data, with its Gaussians, all SH bands and no densification."""
     config = splatfacto_cpu_config()
-    config.early_look = False  # type: ignore[attr-defined]
     config.pipeline.datamanager.dataparser = dataparser_of(open_run(run)).config  # type: ignore[attr-defined]
     trainer = _started(config, None, folder)
     model = trainer.pipeline.model

@@ -145,7 +145,7 @@ def paper_dataset(run: Run) -> str:
     # The scenes of NICE-SLAM's Replica, which the paper follows; it does not say which three it tests on.
     if parser == "ReplicaDataParserConfig" and re.fullmatch(r"room[0-2]|office[0-4]", name):
         try:
-            scene = load_replica(run.data, check_sizes=False)
+            scene = load_replica(run.data)
         except DataError:
             return ""
         size = (scene.params.width, scene.params.height)

@@ -113,7 +113,7 @@ class Capture:
         shutil.rmtree(run, ignore_errors=True)
         words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
         words += ["--timestamp", label, "--max-num-iterations", str(steps), "--vis", "tensorboard"]
-        words += ["--early-look", "False", "--steps-per-eval-image", "0", "--steps-per-save", str(steps)]
+        words += ["--steps-per-eval-image", "0", "--steps-per-save", str(steps)]
         words += [] if cap is None else ["--pipeline.model.max-gs-num", str(cap)]
         return run, _cpu_seconds([*words, *self.arguments[1:]])
 

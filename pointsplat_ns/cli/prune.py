@@ -43,7 +43,6 @@ def prune(
     opacity_weight: float | None = None,
     sh: Bands = "all",
     clean: bool = False,
-    fine_tune: int = 0,
     poses: Poses = None,
     resolution: Resolution = None,
     up: Up = None,
@@ -78,7 +77,6 @@ def prune(
         opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
         sh: SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
-        fine_tune: number of steps of optimising the result against renders of the dense scene.
         poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
             COLMAP project. They must be of this scene. By default the views of its dataset, or of such a file beside
             the scene, or sampled ones; none always samples them.
@@ -118,15 +116,15 @@ def prune(
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
-            keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, fine_tune=fine_tune,
-            resolution=resolution, data=data, shard=shard, force=force,
+            keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, resolution=resolution,
+            data=data, shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, None, shard)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
     claim_outputs(written, force, plot)
-    request = PruneRequest(keep, by, sh, opacity_weight, clean, fine_tune).in_format(format_to_write(output))
+    request = PruneRequest(keep, by, sh, opacity_weight, clean).in_format(format_to_write(output))
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
     if rows is not None:
         if dry_run or plot is not None:

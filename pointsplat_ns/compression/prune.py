@@ -1,7 +1,7 @@
-"""Pruning with all options: cleaning and SH bands first, then a method and a budget, then fine-tuning.
+"""Pruning with all options: cleaning and SH bands first, then a method and a budget.
 
 Views are read or sampled only where they are needed: for a budget in dB, ``auto`` SH, a method that scores by views,
-cleaning that removes a Gaussian, or fine-tuning.
+or cleaning that removes a Gaussian.
 """
 
 from __future__ import annotations
@@ -97,12 +97,6 @@ def prune_scene(
             scene, limit, note = _for_psnr(dense, make, request.budget, views, searching)
         notes = [*notes, note]
         seen = None if merger is None else merger.views
-    if request.fine_tune:
-        from pointsplat_ns.compression.fine_tune import fine_tune
-
-        tuned = views.scored(VIEW_COUNTS.scored)
-        scene = fine_tune(scene, tuned, dense, request.fine_tune, progress=functools.partial(progress, "fine-tuning"))
-        notes.append(f"fine-tuned {request.fine_tune} steps against the dense scene's renders in {len(tuned)} views")
     if views.origin:
         notes.insert(0, views.text)
     if limit is not None and rounding:

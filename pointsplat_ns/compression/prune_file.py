@@ -80,7 +80,6 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
         f"--by {request.by}": request.method.score is not None,
         "--sh auto": request.sh == "auto",
         "--clean": request.clean,
-        "--fine-tune": request.fine_tune > 0,
         f"--keep {request.keep}": found_by_trying(request.budget),
     }
     needing = [name for name, given in asked.items() if given]

@@ -119,8 +119,6 @@ class PruneRequest:
     clean: bool = False
     """Whether to remove Gaussians that no picture needs first (:mod:`~pointsplat_ns.compression.cleaning`). ``keep``
     still refers to the dense scene, and the result has exactly that number of Gaussians."""
-    fine_tune: int = 0
-    """Number of optimisation steps of the result against renders of the dense scene."""
     budget: Keep = field(init=False)
     """``keep``, parsed if it is text."""
 
@@ -128,8 +126,6 @@ class PruneRequest:
         check_opacity_weight(self.method, self.opacity_weight)
         if self.sh not in SH_CHOICES:
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
-        if self.fine_tune < 0:
-            raise PointSplatError(f"{self.fine_tune} steps of fine-tuning; expected 0 for none, or more")
         budget = parse_keep(self.keep) if isinstance(self.keep, str) else self.keep
         if isinstance(budget, WithinPsnr) and not 0 < budget.value < math.inf:
             raise BudgetError(f"the wanted PSNR is {budget.value} dB; expected a positive number, such as 35")

@@ -30,7 +30,7 @@ class ViewCounts:
     stepped: int = 96
     """Sampled views for the steps of repairs."""
     scored: int = 40
-    """Views for fine-tuning and for methods that score by views."""
+    """Views for methods that score by views."""
     opening: int = 24
     """Known views from which those of a page are chosen."""
     walked: int = 12
@@ -162,7 +162,7 @@ class ViewSource:
         return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
-        """At most ``count`` views for scores and for fine-tuning, of the size of :meth:`compared`."""
+        """At most ``count`` views for scores, of the size of :meth:`compared`."""
         return middle_sized(self.views(count))
 
     def others(self, seed: int = 0) -> Iterator[View]:

@@ -1,31 +1,26 @@
 """LPIPS: perceptual distance of images (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep
 Features as a Perceptual Metric").
 
-The convolutions are those of torchvision's AlexNet or VGG16; the linear weights on top come with
-torchmetrics. If the convolutions' weights are not available, :func:`load_lpips` says why, and everything
-else works without LPIPS.
+The network is torchmetrics', with its linear weights, on torchvision's AlexNet or VGG16. If the weights of these are
+not available, :func:`load_lpips` says why, and everything else works without LPIPS.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import socket
 import threading
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import torch
 from cachetools import LRUCache, TTLCache
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import ImageError, as_nchw, per_image
-from pointsplat_ns.system.tensors import FLOATS
 
 Net = Literal["alex", "vgg"]
 
@@ -39,26 +34,20 @@ class LpipsUnavailable(PointSplatError):
 
 @dataclass(frozen=True)
 class _Backbone:
-    """The parts of a torchvision network that LPIPS uses."""
+    """A torchvision network that LPIPS uses."""
 
-    taps: tuple[int, ...]  # layers of ``features``, each a ReLU, whose output is compared
-    channels: tuple[int, ...]  # of those outputs
-    minimum: int  # image side below which the last of them is empty
+    minimum: int  # image side below which its last layer is empty
     files: tuple[str, ...]  # usual file names; the last is torchvision's own
     digest: str  # SHA-256 of torchvision's file, of which its name has the first 8 digits
 
 
 _BACKBONES: dict[str, _Backbone] = {
     "alex": _Backbone(
-        taps=(1, 4, 7, 9, 11),
-        channels=(64, 192, 384, 256, 256),
         minimum=31,
         files=("alexnet_features.pth", "alexnet-owt-7be5be79.pth"),
         digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
     ),
     "vgg": _Backbone(
-        taps=(3, 8, 15, 22, 29),
-        channels=(64, 128, 256, 512, 512),
         minimum=16,
         files=("vgg16_features.pth", "vgg16-397923af.pth"),
         digest="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
@@ -66,17 +55,8 @@ _BACKBONES: dict[str, _Backbone] = {
 }
 
 
-def empty_features(net: Net) -> nn.Sequential:
-    """torchvision's layers up to the last that LPIPS compares, without memory for their weights."""
-    models = _torchvision_models()
-    with torch.device("meta"):
-        network = models.alexnet(weights=None) if net == "alex" else models.vgg16(weights=None, init_weights=False)
-    return network.features[: _BACKBONES[net].taps[-1] + 1]
-
-
 class Lpips(nn.Module):
-    """The LPIPS network. It is frozen: its weights are non-persistent buffers, which move to a device with a parent
-    module but are neither among its parameters nor in its checkpoints.
+    """torchmetrics' LPIPS network, frozen, in float32.
 
     Args:
         net: which backbone.
@@ -84,65 +64,55 @@ class Lpips(nn.Module):
         linear: the state dict of the linear weights, with keys ``linN.model.1.weight`` (1, C, 1, 1).
     """
 
-    shift: Tensor
-    spread: Tensor
-
     def __init__(self, net: Net, backbone: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
         super().__init__()
         self.net = net
-        self._backbone = _BACKBONES[net]
-        # Mean and standard deviation of ImageNet, in units of [-1, 1], as LPIPS was fitted with.
-        self._freeze(self, "shift", torch.tensor([-0.030, -0.088, -0.188], **FLOATS).reshape(1, 3, 1, 1))
-        self._freeze(self, "spread", torch.tensor([0.458, 0.448, 0.450], **FLOATS).reshape(1, 3, 1, 1))
-        self.features = empty_features(net)
-        for index, layer in self.features.named_children():
-            for name, parameter in list(layer.named_parameters()):
-                delattr(layer, name)
-                self._freeze(layer, name, _expect(backbone, f"features.{index}.{name}", tuple(parameter.shape)))
-        for tap, channels in enumerate(self._backbone.channels):
-            self._freeze(self, f"linear{tap}", _expect(linear, f"lin{tap}.model.1.weight", (1, channels, 1, 1)))
-
-    @staticmethod
-    def _freeze(module: nn.Module, name: str, value: Tensor) -> None:
-        module.register_buffer(name, value.detach().to(torch.float32, copy=True), persistent=False)
+        self.network = empty_network(net)
+        weights = {  # net.slice2.5.weight is torchvision's features.5.weight
+            name: _expect(backbone, f"features.{name.split('.', 2)[2]}", tuple(empty.shape))
+            for name, empty in self.network.state_dict().items()
+            if name.startswith("net.")
+        }
+        self.network.load_state_dict({**weights, **linear}, strict=False, assign=True)
+        self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of each image pair.
+        """LPIPS of each image pair, computed in float32.
 
         Args:
             pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for AlexNet, 16 for VGG.
             target: the same shape.
 
         Returns:
-            A scalar, or (B,); 0 for identical images. Differentiable in both.
+            A scalar, or (B,), of the type of ``pred``; 0 for identical images. Differentiable in both.
 
         Raises:
             ImageError: if the images cannot be compared or are too small for the network.
         """
         a, b = as_nchw(pred, target)
-        least = self._backbone.minimum
+        least = _BACKBONES[self.net].minimum
         if min(a.shape[2:]) < least:
             raise ImageError(
                 f"images of {a.shape[3]} x {a.shape[2]} pixels are too small for LPIPS with {self.net}; "
                 f"expected at least {least} x {least}"
             )
-        total = a.new_zeros(a.shape[0])
-        for tap, (fa, fb) in enumerate(zip(self._compared(a), self._compared(b), strict=True)):
-            weight = self.get_buffer(f"linear{tap}").to(fa.dtype)
-            total = total + (weight * (fa - fb).square()).sum(dim=1).mean(dim=(1, 2))
-        return per_image(total, pred)
+        return per_image(self.network(a.float(), b.float(), normalize=True).flatten().to(pred.dtype), pred)
 
-    def _compared(self, images: Tensor) -> list[Tensor]:
-        """Feature maps of images (B, 3, H, W) in [0, 1], each pixel's of length 1 over the channels."""
-        x = (2 * images - 1 - self.shift.to(images.dtype)) / self.spread.to(images.dtype)
-        maps = []
-        for index, layer in enumerate(self.features):
-            # In the type of the images, so that float64 ones are compared in float64.
-            x = functional_call(layer, {name: value.to(x.dtype) for name, value in layer.named_buffers()}, x)
-            if index in self._backbone.taps:
-                # 1e-8, as in torchmetrics: keeps the gradient finite where all features are 0
-                maps.append(x / torch.sqrt(x.square().sum(dim=1, keepdim=True) + 1e-8))
-        return maps
+
+def empty_network(net: Net) -> nn.Module:
+    """torchmetrics' network in evaluation mode, without memory for its weights. Raises LpipsUnavailable if torchvision
+    is not installed, or was built for another torch."""
+    try:
+        import torchvision  # noqa: F401  # torchmetrics' own error does not tell why
+        from torchmetrics.functional.image.lpips import _LPIPS, ScalingLayer
+    except (ImportError, RuntimeError) as error:
+        why = str(error).partition("\n")[0]
+        raise LpipsUnavailable(f"LPIPS needs torchvision, which cannot be imported ({why})") from error
+    with torch.device("meta"):  # no random numbers are drawn for weights that are replaced
+        network = _LPIPS(pretrained=False, net=net, pnet_rand=True)
+    with torch.device("cpu"):
+        network.scaling_layer = ScalingLayer().float()  # constants, which are in no file
+    return network
 
 
 def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: bool = True) -> Lpips:
@@ -166,7 +136,7 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
     """
     if net not in _BACKBONES:
         raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}")
-    _torchvision_models()  # before anything is downloaded
+    empty_network(net)  # before anything is downloaded
     linear = _load(_linear_file(net))
     path = _local_file(net) if backbone is None else Path(backbone)
     if path is None:
@@ -227,16 +197,6 @@ _failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=600.0)  # s
 _cache_lock = threading.Lock()
 
 
-def _torchvision_models() -> ModuleType:
-    """torchvision's networks; LpipsUnavailable if torchvision is not installed, or was built for another torch."""
-    try:
-        from torchvision import models
-    except (ImportError, RuntimeError) as error:
-        why = str(error).partition("\n")[0]
-        raise LpipsUnavailable(f"LPIPS needs torchvision, which cannot be imported ({why})") from error
-    return models
-
-
 def _local_file(net: Net) -> Path | None:
     """The backbone's file on this machine: the one that the environment variable names, or torch hub's copy.
     LpipsUnavailable if the variable names nothing that exists."""
@@ -278,15 +238,14 @@ def _expect(state: Mapping[str, Tensor], key: str, shape: tuple[int, ...]) -> Te
         raise LpipsUnavailable(f"lacks {key!r} (found {', '.join(map(str, list(state)[:3])) or 'no keys'})")
     if tuple(value.shape) != shape:
         raise LpipsUnavailable(f"{key!r} has shape {tuple(value.shape)}, expected {shape}")
-    return value
+    return value.to(torch.float32)
 
 
 def _linear_file(net: Net) -> Path:
-    """The file of linear weights in the installed torchmetrics, which is not imported as that is slow."""
-    spec = importlib.util.find_spec("torchmetrics")
-    if spec is None or not spec.submodule_search_locations:
-        raise LpipsUnavailable("torchmetrics, which carries LPIPS's linear weights, is not installed")
-    return Path(spec.submodule_search_locations[0]) / "functional" / "image" / "lpips_models" / f"{net}.pth"
+    """The file of linear weights that comes with torchmetrics."""
+    from torchmetrics.functional.image import lpips
+
+    return Path(lpips.__file__).with_name("lpips_models") / f"{net}.pth"
 
 
 def _download(net: Net, target: Path, allowed: bool) -> None:

@@ -18,7 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, free_memory_share, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, to_device
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 if TYPE_CHECKING:
@@ -76,8 +76,7 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
     @cached_property
     def frame_cache(self) -> MemoryCache:
         """Decoded photos of both splits."""
-        gigabytes = self.config.cache_gigabytes
-        return MemoryCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
+        return MemoryCache.of(self.config.cache_gigabytes)
 
     @cached_property
     def train_frames(self) -> Frames:

@@ -136,10 +136,10 @@ def _open(path: Path | str, split: Split, data: Path | str | None, cached: bool 
         raise DataError(str(error)) from error
     import_nerfstudio()
 
-    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share
+    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    scene = TrainedScene(scene_name(run), run, MemoryCache(free_memory_share() if cached else 0))
+    scene = TrainedScene(scene_name(run), run, MemoryCache.of() if cached else MemoryCache(0))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
 
 

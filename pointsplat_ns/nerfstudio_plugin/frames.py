@@ -7,88 +7,59 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Literal
 
+import psutil
 import torch
 from cachetools import LRUCache
 from nerfstudio.cameras.cameras import Cameras
 
-from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
-
-Value = TypeVar("Value")
-
-
-def free_memory_share(share: float = 0.25) -> int:
-    """Bytes in a share of the memory that is available now."""
-    try:
-        import psutil
-
-        return int(share * psutil.virtual_memory().available)
-    except (ImportError, OSError):
-        return 1 << 30  # the machine's free memory cannot be read
-
-
-class CacheKey(Generic[Value]):
-    """Base class of the keys of a :class:`MemoryCache`; its parameter is the type of the value. Each kind of value has
-    a key class of its own, a frozen dataclass, so that two kinds cannot be confused."""
-
-
-class _Entry(NamedTuple):
-    value: Any
-    num_bytes: int
-
 
 class MemoryCache:
-    """A least-recently-used cache for values of several kinds, bounded in bytes; a bound of 0 keeps nothing. Safe to
-    share among threads. Values are not copied: do not write to them."""
+    """A least-recently-used cache for values of several kinds, which their keys tell apart, bounded in bytes; a bound
+    of 0 keeps nothing. Safe to share among threads. Values are not copied: do not write to them."""
 
     def __init__(self, max_bytes: int):
         self.max_bytes = max_bytes
-        self._entries: LRUCache[CacheKey[Any], _Entry] = LRUCache(max_bytes, getsizeof=lambda entry: entry.num_bytes)
+        self._entries: LRUCache[Hashable, tuple[Any, int]] = LRUCache(max_bytes, getsizeof=lambda entry: entry[1])
         self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, gigabytes: float | None = None) -> MemoryCache:
+        """A cache of this size, 10^9 bytes; by default of a quarter of the memory that is free now."""
+        return cls(psutil.virtual_memory().available // 4 if gigabytes is None else int(gigabytes * 1e9))
 
     @property
     def num_bytes(self) -> int:
         """Total size of the values, bytes."""
         return int(self._entries.currsize)
 
-    def get(self, key: CacheKey[Value]) -> Value | None:
+    def get(self, key: Hashable) -> Any:
         """The value of ``key``, which then counts as just used; None if there is none."""
         with self._lock:
             entry = self._entries.get(key)
-        return None if entry is None else entry.value
+        return None if entry is None else entry[0]
 
-    def put(self, key: CacheKey[Value], value: Value, num_bytes: int) -> None:
+    def put(self, key: Hashable, value: Any, num_bytes: int) -> None:
         """Store a value, not None, and drop the least recently used ones until the bound holds. An earlier value of the
         same key is replaced. A value larger than the whole cache is not stored."""
         with self._lock:
             self._entries.pop(key, None)
             if num_bytes <= self.max_bytes:
-                self._entries[key] = _Entry(value, num_bytes)
-
-    def __len__(self) -> int:
-        return len(self._entries)
+                self._entries[key] = value, num_bytes
 
 
 Frame = tuple[Cameras, dict[str, Any]]
 """A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""
 
 
-@dataclass(frozen=True)
-class PhotoKey(CacheKey[Frame]):
-    """Key of a decoded photo in a cache that several scenes share."""
-
-    owner: object
-    """Belongs to one :class:`Frames` object only."""
-    index: int
-
-
 class Frames:
-    """The posed photos of one split of a dataset.
+    """The posed photos of one split of a dataset: an
+    :class:`~pointsplat_ns.nerfstudio_plugin.undistorted.UndistortedDataset`, or another with ``cameras``, a length and
+    ``get_data``.
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
@@ -103,14 +74,14 @@ class Frames:
 
     def __init__(
         self,
-        dataset: UndistortedDataset,
+        dataset: Any,
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
         max_workers: int = 2,
     ):
         self.dataset = dataset
         self.image_type: Literal["uint8", "float32"] = image_type
-        self.cache = MemoryCache(free_memory_share()) if cache is None else cache
+        self.cache = MemoryCache.of() if cache is None else cache
         self._owner = object()
         self._max_workers = max_workers
         self._pool: ThreadPoolExecutor | None = None
@@ -126,7 +97,7 @@ class Frames:
         index %= len(self)
         with self._lock:
             loading = self._loading.get(index)
-        frame = loading.result() if loading is not None else self.cache.get(PhotoKey(self._owner, index))
+        frame = loading.result() if loading is not None else self.cache.get(("photo", self._owner, index))
         if frame is None:
             frame = self._load_and_keep(index)
         camera, data = frame
@@ -141,7 +112,7 @@ class Frames:
         """Start decoding photos that will be needed soon. An error is raised when the photo is asked for."""
         for index in indices:
             with self._lock:
-                if index in self._loading or self.cache.get(PhotoKey(self._owner, index)) is not None:
+                if index in self._loading or self.cache.get(("photo", self._owner, index)) is not None:
                     continue
                 if self._pool is None:
                     self._pool = ThreadPoolExecutor(self._max_workers, thread_name_prefix="frames")
@@ -155,7 +126,7 @@ class Frames:
 
     def _load_and_keep(self, index: int) -> Frame:
         frame = self._load(index)
-        self.cache.put(PhotoKey(self._owner, index), frame, _bytes_of(frame[1]))
+        self.cache.put(("photo", self._owner, index), frame, _bytes_of(frame[1]))
         return frame
 
     def _load(self, index: int) -> Frame:

@@ -239,17 +239,11 @@ def _read(folder: Path, name: str) -> dict[int, Any]:
     """One of COLMAP's files, by nerfstudio's readers; a DataError if it is missing or broken."""
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-    readers = {
-        ("images", ".bin"): colmap.read_images_binary,
-        ("images", ".txt"): colmap.read_images_text,
-        ("points3D", ".bin"): colmap.read_points3D_binary,
-        ("points3D", ".txt"): colmap.read_points3D_text,
-    }
-    for suffix in (".bin", ".txt"):
+    for suffix, kind in ((".bin", "binary"), (".txt", "text")):
         path = folder / f"{name}{suffix}"
         if path.is_file():
             try:
-                return readers[name, suffix](path)
+                return getattr(colmap, f"read_{name}_{kind}")(path)
             except Exception as error:  # these readers check nothing
                 raise DataError(f"{path}: cannot be read as COLMAP's: {type(error).__name__}: {error}") from error
     raise DataError(f"{folder}: no {name}.bin or {name}.txt; expected COLMAP's; or give --load-seed-points False")

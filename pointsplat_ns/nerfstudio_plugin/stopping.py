@@ -34,10 +34,6 @@ STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
 
-_AT_LEAST_ONE = ("steps_per_log", "max_buffer_size")
-"""Numbers of the log of which nerfstudio's writer cannot use 0."""
-
-
 @dataclass
 class StoppableTrainerConfig(TrainerConfig):
     """nerfstudio's trainer config, with the number of threads"""
@@ -231,14 +227,11 @@ class StoppableTrainer(Trainer):
             raise KeyboardInterrupt
 
     def _need_steps(self) -> None:
-        numbers = {"max-num-iterations": self.config.max_num_iterations}
-        numbers |= {f"logging.{n.replace('_', '-')}": getattr(self.config.logging, n) for n in _AT_LEAST_ONE}
-        for option, number in numbers.items():
-            if number < 1:
-                raise PointSplatError(
-                    f"--{option} {number}: expected at least 1; a run is shown and measured without a training by "
-                    "ns-viewer, ns-render and ns-eval"
-                )
+        if self.config.max_num_iterations < 1:
+            raise PointSplatError(
+                f"--max-num-iterations {self.config.max_num_iterations}: expected at least 1; a run is shown and "
+                "measured without a training by ns-viewer, ns-render and ns-eval"
+            )
 
     def _withdraw(self) -> None:
         config = self.base_dir / "config.yml"

@@ -29,9 +29,9 @@ class UndistortedDataset(InputDataset):
     """Photos, masks and cameras of a split, undistorted together by nerfstudio's own function.
 
     ``cameras`` (C,) are pinholes. They differ in size and intrinsics from ``lens_cameras``, which took the photos,
-    where these have a lens. Raises DataError if a photo has no pose, a pose or an intrinsic is NaN or infinite, photos
-    are of several times, or a lens cannot be undone; when a photo is read that is missing, broken, not the size that
-    its camera says, or not of 8 bits a channel, or whose mask is.
+    where these have a lens. Raises DataError if a pose or an intrinsic is NaN or infinite, photos are of several times,
+    or a lens cannot be undone; when a photo is read that is missing, broken, not the size that its camera says, or not
+    of 8 bits a channel, or whose mask is.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
@@ -42,7 +42,6 @@ class UndistortedDataset(InputDataset):
             self.cameras.width, self.cameras.height = (
                 (size.double() * scale_factor).long() for size in (given.width, given.height)
             )
-        _need_poses(self)
         _need_finite(self)
         _need_one_time(self)
         self.lens_cameras = self.cameras
@@ -138,18 +137,6 @@ def _undistorted(
             f"{path}: the lens distortion of its camera leaves nothing of the photo; check its coefficients"
         )
     return K, image, mask
-
-
-def _need_poses(dataset: InputDataset) -> None:
-    """Refuse poses that are not one for each photo. nerfstudio's ``instant-ngp-data`` loses that of a single photo: it
-    indexes a numpy array by a tensor of one number, which numpy takes for the number."""
-    found, expected = tuple(dataset.cameras.camera_to_worlds.shape), (len(dataset.image_filenames), 3, 4)
-    if dataset.image_filenames and found != expected:
-        raise DataError(
-            f"{dataset.image_filenames[0]}: the dataparser gives poses of shape {found} for this photo and "
-            f"{expected[0] - 1} more of its split; expected {expected}; if it is the only photo held out, let the "
-            "dataparser hold out two (instant-ngp-data loses the pose of a single one), as by --train-split-fraction"
-        )
 
 
 def _need_finite(dataset: InputDataset) -> None:

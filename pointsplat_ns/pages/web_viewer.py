@@ -37,7 +37,7 @@ class WebViewerPackage:
     integrity: str = "L7w0BlagAonRHQg5qhaDyBB8zrRtiU9QgglNU3kUgsqHpokCAtuf9j4P0kxsUaQn61FZ1qJGkRKsOCbrLCDR0w=="
     """SHA-512 of the tarball as npm's registry has it, in base64."""
     variable: str = "POINTSPLAT_WEB_VIEWER"
-    """Environment variable: a tarball of the package, or the folder that one was unpacked to."""
+    """Environment variable: a tarball of the package."""
     members: Mapping[str, str] = field(
         default_factory=lambda: {
             "public/index.html": "index.html",
@@ -65,8 +65,7 @@ class WebViewerPackage:
     @property
     def remedy(self) -> str:
         """What to do without a network."""
-        made = f"npm pack {self.name}@{self.version}"
-        return f"set {self.variable} to its tarball ({made}) or to the folder that it was unpacked to"
+        return f"set {self.variable} to its tarball (npm pack {self.name}@{self.version})"
 
     def is_it(self, data: bytes) -> bool:
         """Whether these are the bytes of the tarball."""
@@ -135,9 +134,9 @@ def web_viewer(package: WebViewerPackage | None = None) -> WebViewer:
     if named:
         place = Path(named).expanduser()
         try:
-            return _of_folder(place, package) if place.is_dir() else _of_tarball(_read(place, package), package)
+            return _of_tarball(_read(place, package), package)
         except (OSError, ValueError) as error:
-            wanted = f"expected a tarball of {package.name}, or a folder that one was unpacked to"
+            wanted = f"expected a tarball of {package.name}"
             raise PointSplatError(f"{place}, which {package.variable} names: {one_line(error)}; {wanted}") from error
     cached, data = folder and folder / package.tarball, b""
     if cached is not None:
@@ -194,11 +193,6 @@ def _of_tarball(data: bytes, package: WebViewerPackage) -> WebViewer:
     except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
         raise ValueError(f"no tarball, or a damaged one ({one_line(error)})") from error
     return WebViewer(files)
-
-
-def _of_folder(folder: Path, package: WebViewerPackage) -> WebViewer:
-    """The viewer from the folder of an unpacked package. Raises OSError or ValueError as :func:`_read`."""
-    return WebViewer({written: _read(folder / name, package) for name, written in package.members.items()})
 
 
 def _read(path: Path, package: WebViewerPackage) -> bytes:

@@ -108,21 +108,14 @@ def share_state(module: nn.Module) -> None:
 
 
 @torch.no_grad()
-def average_gradients(parameters: Iterable[nn.Parameter], steps: int = 1) -> None:
-    """Divide gradients that were summed over ``steps`` by that number, and average them over processes.
-
-    With several processes, a parameter without a gradient in any of them gets a gradient of zeros.
-    """
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Average gradients over processes. With several, a parameter without a gradient in any of them gets zeros."""
     parameters = list(parameters)
-    share = 1.0 / (steps * world_size())
-    if share == 1.0 or not parameters:
+    if world_size() == 1 or not parameters:
         return
-    if world_size() > 1:
-        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([grad.reshape(-1) for grad in grads])
-        dist.all_reduce(flat)
-        for p, grad, mean in zip(parameters, grads, flat.split([g.numel() for g in grads]), strict=True):
-            p.grad = grad.copy_(mean.view_as(grad))
-    for p in parameters:
-        if p.grad is not None:
-            p.grad.mul_(share)
+    grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    flat = torch.cat([grad.reshape(-1) for grad in grads])
+    dist.all_reduce(flat)
+    flat.mul_(1.0 / world_size())
+    for p, grad, mean in zip(parameters, grads, flat.split([g.numel() for g in grads]), strict=True):
+        p.grad = grad.copy_(mean.view_as(grad))

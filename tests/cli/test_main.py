@@ -170,7 +170,7 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
 @pytest.mark.parametrize(
     ("words", "name", "value"),
     [
-        ("prune a.ply --fine-tune 1k", "fine_tune", 1000),
+        ("view a.ply --port 8k", "port", 8000),
         ("make-refiner --steps 1,000", "steps", 1000),
         ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
         ("demo --keep 20%", "keep", 0.2),
@@ -196,5 +196,5 @@ def test_an_option_understands_a_number_as_people_write_it(words, name, value, m
 
 def test_what_is_no_number_is_refused_with_those_that_are(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["prune", "a.ply", "--fine-tune", "1.5"])
+        main(["view", "a.ply", "--port", "1.5"])
     assert end.value.code == 2 and "is no whole number" in " ".join(capsys.readouterr().err.split())

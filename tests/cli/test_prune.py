@@ -105,7 +105,6 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
         (("--by", "best"), f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
         (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
         (("--keep", "half"), "keep is 'half'"),
-        (("--fine-tune", "-1"), "-1 steps of fine-tuning"),
         (("--plot", "out.jpg"), "ends in .png"),
     ],
 )

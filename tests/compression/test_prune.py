@@ -92,7 +92,6 @@ def test_what_is_no_scene_is_refused(scene):
         ({"sh": "4"}, "sh is '4'; expected all, auto or a degree from 0 to 3"),
         ({"keep": "half"}, "keep is 'half'"),
         ({"keep": WithinPsnr(-1.0)}, "the wanted PSNR is -1.0 dB"),
-        ({"fine_tune": -1}, "-1 steps of fine-tuning; expected 0 for none, or more"),
         ({"by": "merge", "opacity_weight": 0.5}, "opacity weight 0.5: merge does not weigh opacity"),
     ],
 )
@@ -186,10 +185,3 @@ def test_the_command_writes_the_scene_and_its_levels(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
     main([*arguments, "--force", "--json"])
     assert [level["count"] for level in json.loads(capsys.readouterr().out)["levels"]] == [400, 200, 100]
-
-
-def test_fine_tuning_follows_where_it_is_asked_for(scene, views):
-    plain = pruned(scene, None, 0.3, "coverage").scene
-    tuned = pruned(scene, views, 0.3, "coverage", fine_tune=10).scene
-    reference = DenseReference(scene, views)
-    assert len(tuned) == len(plain) and reference.psnr(tuned)[0] > reference.psnr(plain)[0]

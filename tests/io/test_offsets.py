@@ -230,16 +230,6 @@ def test_two_scenes_are_filmed_in_the_frame_of_the_first(tmp_path):
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
 
-def test_a_pruned_scene_of_a_training_keeps_its_offset_and_up(tmp_path):
-    pytest.importorskip("nerfstudio", reason="the plugin imports it")
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import read_pruned, write_pruned
-
-    scene = cloud(20).replace(offset=UTM, up="-y", antialiased=True)
-    write_pruned(tmp_path / "a.safetensors", scene, 40, 1.0)
-    back, count, _ = read_pruned(tmp_path / "a.safetensors")
-    assert back.traits == scene.traits and count == 40 and same_bits(back, scene)
-
-
 def test_a_ply_that_is_pruned_in_parts_keeps_its_offset_and_takes_poses_of_its_frame(tmp_path):
     with_doubles(ball(4000, log_size=math.log(0.1)), tmp_path / "a.ply")
     main(["prune", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.ply"), "--keep", "50%", "--memory", "4GB"])

@@ -134,7 +134,7 @@ def test_steps_use_the_threads_chosen_or_set(
     monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
     monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
     config = wall_config(wall_scene, tmp_path, 3)
-    config.threads, config.early_look = count, False
+    config.threads = count
     config.steps_per_eval_image = 0
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

@@ -70,16 +70,13 @@ def test_two_trainings_of_one_timestamp_leave_two_results(wall_scene, wall_confi
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-@pytest.mark.parametrize(
-    ("option", "number"), [("max-num-iterations", 0), ("max-num-iterations", -3), ("logging.steps-per-log", 0)]
-)
-def test_no_steps_are_refused_and_leave_no_folder(option, number, resumed, wall_scene, wall_config, tmp_path):
+@pytest.mark.parametrize("number", [0, -3])
+def test_no_steps_are_refused_and_leave_no_folder(number, resumed, wall_scene, wall_config, tmp_path):
     configs = [wall_config(wall_scene, tmp_path / "scene", 2), small_config(wall_scene, tmp_path / "refiner", 2)]
     for config in configs:
-        *group, name = option.replace("-", "_").split(".")
-        setattr(getattr(config, group[0]) if group else config, name, number)
+        config.max_num_iterations = number
         config.load_dir = tmp_path / "checkpoints" if resumed else None
         config.save_config()
-        with pytest.raises(PointSplatError, match=f"--{option} {number}: expected at least 1"):
+        with pytest.raises(PointSplatError, match=f"--max-num-iterations {number}: expected at least 1"):
             config.setup(local_rank=0, world_size=1).setup()
         assert not config.output_dir.exists()

@@ -83,17 +83,10 @@ def test_without_a_network_it_says_what_to_do(error, cache, monkeypatch):
     assert files_below(cache) == []
 
 
-@pytest.mark.parametrize("kind", ["tarball", "folder"])
-def test_a_local_package_is_taken_first_whatever_its_version(kind, tmp_path, monkeypatch):
+def test_a_local_package_is_taken_first_whatever_its_version(tmp_path, monkeypatch):
     asked = answering(monkeypatch, OSError("no network"))
-    place = tmp_path / kind
-    if kind == "tarball":
-        place.write_bytes(tarball())
-    else:
-        for name, data in MEMBERS.items():
-            file = place / name.removeprefix("package/")
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(data)
+    place = tmp_path / "viewer.tgz"
+    place.write_bytes(tarball())
     monkeypatch.setenv("POINTSPLAT_WEB_VIEWER", str(place))
     assert web_viewer() == small_viewer() and asked == []
 

@@ -130,7 +130,7 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     }
     for by, method in METHODS.items():
         found[f"pruned by {by}"] = ps.prune(room, 0.3, by=by, views=views if method.needs_views else None)
-    found["pruned and tuned"] = ps.prune(room, 0.3, sh="auto", clean=True, fine_tune=2, views=views)
+    found["cleaned and pruned"] = ps.prune(room, 0.3, sh="auto", clean=True, views=views)
     compacted = ps.compact(room, 0.3, views=views)
     repaired = compacted.repaired
     assert repaired is not None

@@ -41,7 +41,6 @@ def test_a_training_takes_them_as_zero(wall_scene, wall_config, tmp_path, monkey
 
     monkeypatch.setattr(SplatfactoCpuModel, "get_loss_dict", losses)
     config = wall_config(wall_scene, tmp_path, 2)
-    config.early_look = False
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     trainer.train()

@@ -53,14 +53,13 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
-    gradient_accumulation_steps: dict[str, int] = field(default_factory=dict)
-    """Steps, each on one scene, whose gradients are averaged before an update: ``all 4``, or by part of the network."""
     max_skipped_steps: int = 10
     """Total number of steps that may be skipped because a loss or a gradient is not finite (a broken photo or scene,
     rates too high), before training stops and names the scenes. It is a total, not a number of steps in a row: a scene
     that is broken fails each time its turn comes, and the steps on other scenes in between would reset the count."""
 
-    # A setting of nerfstudio's text-to-NeRF methods: hidden on the command line.
+    # Settings of nerfstudio's that have no effect here: hidden on the command line.
+    gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
     prompt: Suppress[Fixed[str | None]] = None
 
     def set_timestamp(self) -> None:

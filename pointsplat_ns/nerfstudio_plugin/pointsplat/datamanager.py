@@ -21,7 +21,7 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, free_memory_share, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, to_device
 from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
@@ -103,8 +103,7 @@ class ScenesDataManager(SpiralSource):
         self.background = Background()
         """Prepares scenes before the steps that use them."""
         self._pixels = 0
-        gigabytes = config.cache_gigabytes
-        self.cache = MemoryCache(free_memory_share() if gigabytes is None else int(gigabytes * 1e9))
+        self.cache = MemoryCache.of(config.cache_gigabytes)
         held_out_poses = max(1, config.sampled_poses // 5)
         poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
         self.supervision, self.scenes = training_scenes(

@@ -6,10 +6,9 @@ of PLY files can thus be a training set.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import random
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,35 +21,18 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
-from pointsplat_ns.nerfstudio_plugin.frames import CacheKey, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
 
 Split = Literal["train", "test"]
 """The training photos of a dataset, or its held-out ones."""
-
-
-@dataclass(frozen=True)
-class DenseKey(CacheKey[Gaussians]):
-    """Key of a scene's Gaussians in a cache that several scenes share."""
-
-    scene: str
-
-
-@dataclass(frozen=True)
-class RenderKey(CacheKey[tuple[Cameras, dict[str, Any]]]):
-    """Key of a scene's render in a cache that several scenes share."""
-
-    scene: str
-    split: Split
-    index: int
 
 
 @dataclass(frozen=True)
@@ -96,11 +78,6 @@ class DenseScene:
         folder is moved, and changes if the scene is trained again."""
         raise NotImplementedError
 
-    @cached_property
-    def content(self) -> str:
-        """SHA-256 of the file that holds the Gaussians. Pruned scenes on disk are found by it."""
-        return content_hash(self.source)
-
     @property
     def rasterize_mode(self) -> RasterizeMode:
         """Rasterize mode that the scene is rendered with."""
@@ -117,11 +94,12 @@ class DenseScene:
 
     def dense(self, keep: bool) -> Gaussians:
         """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""
-        dense = self.cache.get(DenseKey(self.name))
+        key = "dense", self.name
+        dense = self.cache.get(key)
         if dense is None:
             dense = self.read_dense()
             if keep:
-                self.cache.put(DenseKey(self.name), dense, sum(value.nbytes for value in dense.tensors()))
+                self.cache.put(key, dense, sum(value.nbytes for value in dense.tensors()))
         return dense
 
     def cameras(self, split: Split) -> Cameras:
@@ -143,12 +121,12 @@ class DenseScene:
     @cached_property
     def rendered_train(self) -> RenderedFrames:
         """Renders of the dense scene from the training poses, in 8 bits as photos are."""
-        return RenderedFrames(self, "train", "uint8")
+        return RenderedFrames(RenderedDataset(self, "train"), "uint8", self.cache)
 
     @cached_property
     def rendered_eval(self) -> RenderedFrames:
         """Renders of the dense scene from the held-out poses, not rounded."""
-        return RenderedFrames(self, "test", "float32")
+        return RenderedFrames(RenderedDataset(self, "test"), "float32", self.cache)
 
     @property
     def train_frames(self) -> Any:
@@ -188,59 +166,17 @@ class PlyScene(DenseScene):
         return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
 
 
-class RenderedFrames(Sequence[tuple[Cameras, dict[str, Any]]]):
-    """Renders of a dense scene from the cameras of a split, computed when they are needed and kept while the cache has
-    room: integers in [0, 255], or floats in [0, 1]. ``frames[i]`` is ``(camera, data)`` as in
-    :class:`~pointsplat_ns.nerfstudio_plugin.frames.Frames`."""
+class RenderedDataset:
+    """Renders of a dense scene from the cameras of a split, with the part of a dataset's interface that nerfstudio's
+    viewer and ``ns-render`` use."""
 
-    def __init__(self, scene: DenseScene, split: Split, image_type: Literal["uint8", "float32"]):
-        self._scene, self._split, self.image_type = scene, split, image_type
+    def __init__(self, scene: DenseScene, split: Split):
+        self._scene, self._split = scene, split
 
     @cached_property
     def cameras(self) -> Cameras:
         """The cameras, found when they are first needed."""
         return self._scene.cameras(self._split)
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index: int) -> tuple[Cameras, dict[str, Any]]:  # type: ignore[override]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        index %= len(self)
-        key = RenderKey(self._scene.name, self._split, index)
-        frame = self._scene.cache.get(key)
-        if frame is None:
-            camera = self.cameras[index : index + 1]
-            image = self._scene.picture(camera)
-            if self.image_type == "uint8":
-                image = (255 * image).round().to(torch.uint8)
-            frame = camera, {"image": image, "image_idx": index}
-            self._scene.cache.put(key, frame, image.nbytes)
-        return copy.deepcopy(frame[0]), frame[1].copy()
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        return (self[index] for index in range(len(self)))
-
-    def prefetch(self, indices: Iterable[int]) -> None:
-        """Does nothing: rendering ahead would slow the current step."""
-
-    @property
-    def dataset(self) -> RenderedDataset:
-        """As a nerfstudio dataset, for the viewer and ``ns-render``."""
-        return RenderedDataset(self)
-
-
-class RenderedDataset:
-    """Renders of a scene, with the part of a dataset's interface that nerfstudio's viewer and ``ns-render`` use."""
-
-    def __init__(self, frames: RenderedFrames):
-        self._frames = frames
-
-    @property
-    def cameras(self) -> Cameras:
-        """The cameras of the renders."""
-        return self._frames.cameras
 
     @property
     def _dataparser_outputs(self) -> DataparserOutputs:
@@ -252,8 +188,25 @@ class RenderedDataset:
         return True  # of no scene are there no poses; nerfstudio asks before they have to be found
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.cameras)
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """A render, integers in [0, 255] or floats in [0, 1], and its index, as nerfstudio's datasets give photos."""
+        image = self._scene.picture(self.cameras[image_idx : image_idx + 1])
+        return {
+            "image": (255 * image).round().to(torch.uint8) if image_type == "uint8" else image,
+            "image_idx": image_idx,
+        }
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        _, data = self._frames[index]
+        frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
+        _, data = frames[index]  # from the cache
         return {**data, "image": in_unit_range(data["image"])}
+
+
+class RenderedFrames(Frames):
+    """Renders of a dense scene from the cameras of a split, computed when they are needed and kept while the cache has
+    room."""
+
+    def prefetch(self, indices: Iterable[int]) -> None:
+        """Does nothing: rendering ahead would slow the current step."""

@@ -1,4 +1,4 @@
-"""Training one network in several processes: losses and batch norm over all of them."""
+"""Training one network in several processes: losses over all of them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
+from torch import Tensor
 
-from pointsplat_ns.refiner.layers import BatchNorm
 from pointsplat_ns.system.processes import world_size
 
 
@@ -32,44 +31,3 @@ def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[st
 def with_value(local: Tensor, value: Tensor) -> Tensor:
     """A scalar with the value of ``value`` and the gradient of ``local``."""
     return local + (value - local).detach()
-
-
-class SyncedBatchNorm(BatchNorm):
-    """Batch norm with statistics over the points of all processes: ``[N, C] -> [N, C]``.
-
-    torch's own synchronised batch norm needs a GPU.
-    """
-
-    running_mean: Tensor
-    running_var: Tensor
-    num_batches_tracked: Tensor
-    momentum: float
-
-    def forward(self, x: Tensor) -> Tensor:
-        if not self.training or world_size() == 1:
-            return super().forward(x)
-        from torch.distributed.nn.functional import all_reduce
-
-        sums = all_reduce(torch.cat([x.sum(0), x.new_full((1,), len(x))]))
-        count = sums[-1].detach()
-        if float(count) < 2:  # no variance: use the running statistics
-            mean, variance = self.running_mean, self.running_var
-        else:
-            mean = sums[:-1] / count
-            variance = all_reduce((x - mean).square().sum(0)) / count
-            self._track(mean.detach(), variance.detach(), count)
-        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
-
-    @torch.no_grad()
-    def _track(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
-        self.num_batches_tracked.add_(1)
-        momentum = max(self.momentum, 1.0 / float(self.num_batches_tracked))
-        self.running_mean.lerp_(mean, momentum)
-        self.running_var.lerp_(variance * count / (count - 1), momentum)
-
-
-def synchronise_batch_norm(module: nn.Module) -> None:
-    """Turn every batch norm in a module into a :class:`SyncedBatchNorm`, with the same parameters and statistics."""
-    for part in module.modules():
-        if type(part) is BatchNorm:
-            part.__class__ = SyncedBatchNorm

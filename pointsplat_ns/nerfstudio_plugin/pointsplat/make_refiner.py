@@ -232,7 +232,6 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
         "pipeline.model.pixel-loss": "rmse",
         "pipeline.model.lpips-weight": 0.05,
         "rate-factor": 8,
-        "pipeline.model.pruned-folder": scenes.parent / "pruned",
     }
     unseen = tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     return train_refiner_command(scenes, output, name, steps, timestamp, unseen, options)

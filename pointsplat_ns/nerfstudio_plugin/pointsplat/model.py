@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -52,8 +51,6 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Rotate, mirror and recolour each training scene at random, so that the network learns neither the up direction
     nor the colours of the training scenes. The target images do not change. A scene's neighbour tables are then
     computed anew at each step."""
-    pruned_folder: Path | None = None
-    """Folder for pruned scenes. Other trainings on the same scenes read them from there."""
     by: str = "merge"
     """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians with the highest
     score: coverage, paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
@@ -102,23 +99,12 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         }
 
     def check(self) -> None:
-        """Raise a PointSplatError for settings that fit no scene, and for options that would have no effect."""
+        """Raise a PointSplatError for settings that fit no scene."""
         for keep in (self.keep, *self.more_keeps):
             self.prune_settings(keep)
         if not 0 <= self.lpips_weight < math.inf:  # NaN fails too
             raise PointSplatError(
                 f"--pipeline.model.lpips-weight {self.lpips_weight:g}: expected a finite number, 0 or above"
-            )
-        if self.lpips_weight == 0 and self.lpips_net != "auto":
-            raise PointSplatError(
-                f"--pipeline.model.lpips-net {self.lpips_net}: at --pipeline.model.lpips-weight 0 the loss has no "
-                "LPIPS; give a weight above 0, or leave the network out"
-            )
-        if self.backend == "gsplat" and (self.compiled or self.quality != "exact"):
-            option = "compiled True" if self.compiled else f"quality {self.quality}"
-            raise PointSplatError(
-                f"--pipeline.model.{option}: has no effect on --pipeline.model.backend gsplat; leave it out, or take "
-                "the backend torch or auto"
             )
 
 
@@ -146,7 +132,7 @@ class PointSplatModel(SplatfactoModel):
         self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache, background)
 
     def _pruned_within(self, cache: MemoryCache, background: Background) -> PrunedScenes:
-        return PrunedScenes(cache, self.config.pruned_folder, self.refiner.prepare, background)
+        return PrunedScenes(cache, self.refiner.prepare, background)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the

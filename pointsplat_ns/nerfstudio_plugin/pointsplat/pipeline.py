@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +28,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.training_state import TrainingState
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
@@ -53,9 +53,21 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
     model: PointSplatModelConfig = field(default_factory=PointSplatModelConfig)
 
 
+@dataclass
+class TrainingState:
+    """The state of a training that checkpoints hold beside weights and optimisers."""
+
+    trained_on: set[str]
+    """Identities of the scenes that the network has been trained on, also before it was resumed."""
+    seconds: float = 0.0
+    """Duration of the training so far, also before it was resumed."""
+    skipped: Counter[str] = field(default_factory=Counter)
+    """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
+
+
 class PointSplatPipeline(VanillaPipeline):
     """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
-    ``--data`` holds no scene, or ``world_size`` processes are not connected."""
+    ``--data`` holds no scene, ``world_size`` processes are not connected, or several share batch norm."""
 
     datamanager: ScenesDataManager
     config: PointSplatPipelineConfig
@@ -75,6 +87,11 @@ class PointSplatPipeline(VanillaPipeline):
                 f"{world_size} processes are asked for and {processes.world_size()} are connected; start them with "
                 "torchrun, or, on GPUs, by ns-train --machine.num-devices"
             )
+        if world_size > 1 and config.model.norm == "batch":
+            raise SceneError(
+                "--pipeline.model.norm batch: its statistics are of the scenes of one process; expected scene or layer "
+                "where several processes train together"
+            )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
@@ -87,21 +104,24 @@ class PointSplatPipeline(VanillaPipeline):
         manager = self.datamanager
         self.model.attach(manager.scenes, manager.shown, manager.cache, manager.background)
         processes.share_state(self.model.refiner)
-        if world_size > 1:
-            distributed.synchronise_batch_norm(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
-        self.training_state = TrainingState(self.model.get_param_groups(), trained_on)
+        self.training_state = TrainingState(set(trained_on))
         """State of the training that checkpoints hold beside weights and optimisers."""
 
     def get_extra_state(self) -> dict[str, Any]:
         """The training state, for torch's ``state_dict``."""
-        return self.training_state.to_dict()
+        state = self.training_state
+        return {"trained_on": sorted(state.trained_on), "skipped": dict(state.skipped), "seconds": state.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Load the training state of a checkpoint; logs which of its scenes are missing now."""
-        scenes = self.datamanager.scenes
-        self.training_state.load(state, [scene.name for scene in scenes])
+        """Load the training state of a checkpoint; logs which of its scenes are missing now. The counts of skipped
+        steps of these are dropped."""
+        scenes, ours = self.datamanager.scenes, self.training_state
+        there = {scene.name for scene in scenes}
+        ours.seconds = state.get("seconds", 0.0)
+        ours.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
+        ours.trained_on |= set(state["trained_on"])
         gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
         if gone:
             CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")

@@ -53,6 +53,8 @@ def dataparser_of(run: Run) -> DataParser:
     fields = {f.name for f in dataclasses.fields(config)}
     for field_name, value in run.dataparser_fields.items():
         if field_name not in fields:
+            if value is None:
+                continue  # an option that was not given, and is gone
             raise SceneError(
                 f"{run.config_path}: its dataparser has no setting {field_name!r}; install the version it had"
             )

@@ -6,8 +6,7 @@ import functools
 import math
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -44,22 +43,16 @@ def rate_factor_at(share: float, schedule: Literal["cosine", "step"]) -> float:
 
 
 class AveragingOptimizers(Optimizers):
-    """nerfstudio's optimisers, with gradients averaged over accumulated steps and over processes.
-
-    nerfstudio sums accumulated gradients. Their norm, which clipping depends on, would then grow with their number.
-    ``counted`` is the number of accumulated steps by group; the trainer keeps it up to date. ``factor_after`` is the
-    learning rate over its peak after a number of steps, for groups whose config has no scheduler.
-    """
+    """nerfstudio's optimisers, with gradients averaged over processes. ``factor_after`` is the learning rate over its
+    peak after a number of steps, for groups whose config has no scheduler."""
 
     def __init__(
         self,
         config: dict[str, Any],
         param_groups: dict[str, list[nn.Parameter]],
-        counted: Mapping[str, int],
         factor_after: Callable[[int], float],
     ):
         super().__init__(config, param_groups)
-        self._counted = counted
         for name, optimizer in self.optimizers.items():
             if name not in self.schedulers:
                 self.schedulers[name] = LambdaLR(optimizer, factor_after)
@@ -67,7 +60,7 @@ class AveragingOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler, param_groups: list[str]) -> None:
         """As nerfstudio's, with averaged gradients."""
         for group in param_groups:
-            processes.average_gradients(self.parameters[group], self._counted[group])
+            processes.average_gradients(self.parameters[group])
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
@@ -75,11 +68,8 @@ class PointSplatTrainer(StoppableTrainer):
     """nerfstudio's trainer, with averaged gradients, that skips steps whose loss or gradients are not finite.
 
     If a loss or a gradient is NaN or infinite in any process, all processes skip the step: it changes neither
-    parameters nor the optimisers' state nor running statistics. (With synchronised batch norm a NaN in one process
-    spreads to all.) The step is logged with its scene, counted, and left out of the mean of accumulated gradients. The
-    learning-rate schedule still advances, as it counts the steps of the run.
-
-    A checkpoint between two updates holds the gradients accumulated so far. Checkpoints also come every
+    parameters nor the optimisers' state nor running statistics. The step is logged with its scene and
+    counted. The learning-rate schedule still advances, as it counts the steps of the run. Checkpoints also come every
     :data:`SECONDS_BETWEEN_CHECKPOINTS`.
     """
 
@@ -90,30 +80,19 @@ class PointSplatTrainer(StoppableTrainer):
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
         super().__init__(config, local_rank, world_size)
-        steps = self.config.gradient_accumulation_steps
-        self.gradient_accumulation_steps = defaultdict(lambda: steps.get("all", 1), steps)
         self._latest = self.clock()
         self._seconds_of_checkpoint = 0.0
         self._last_step = sys.maxsize
 
     def setup_optimizers(self) -> AveragingOptimizers:
-        """The optimisers. Raises PointSplatError if ``gradient_accumulation_steps`` names an unknown part of the
-        network or a number below 1, ``max_skipped_steps`` is negative, or ``seconds`` are not a positive number."""
-        groups = self.pipeline.get_param_groups()
-        for name, steps in self.config.gradient_accumulation_steps.items():
-            if name not in (*groups, "all") or steps < 1:
-                raise PointSplatError(
-                    f"--gradient-accumulation-steps {name} {steps}: expected all or one of {', '.join(groups)}, and "
-                    "at least 1"
-                )
+        """The optimisers. Raises PointSplatError if ``max_skipped_steps`` or ``seconds`` are out of range."""
         if self.config.max_skipped_steps < 0:
             raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
         if self.config.seconds is not None and not 0 < self.config.seconds < math.inf:  # NaN fails too
             raise PointSplatError(f"--seconds {self.config.seconds:g}: expected a finite number above 0")
         return AveragingOptimizers(
             self.config.optimizers.copy(),
-            groups,
-            self.pipeline.training_state.counted,
+            self.pipeline.get_param_groups(),
             lambda steps: rate_factor_at(self.share(steps), self.config.schedule),
         )
 
@@ -138,9 +117,9 @@ class PointSplatTrainer(StoppableTrainer):
         """As nerfstudio's, but skips a step whose loss or gradients are not finite. With a gradient scaler
         (``--mixed-precision``), the scaler handles gradients that overflow. If more than ``max_skipped_steps`` have
         been skipped, a checkpoint is saved, and a SceneError ends training."""
-        pipeline, state, every = self.pipeline, self.pipeline.training_state, self.gradient_accumulation_steps
+        pipeline, state = self.pipeline, self.pipeline.training_state
         statistics = [(buffer, buffer.clone()) for buffer in pipeline.model.refiner.buffers()]
-        gathered = state.set_gradients_aside(step, every)
+        self.optimizers.zero_grad_all()
         device_type = self.device.split(":")[0]
         with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
             _, losses, metrics = pipeline.get_train_loss_dict(step=step)
@@ -154,7 +133,7 @@ class PointSplatTrainer(StoppableTrainer):
         if skip:
             self._forget(statistics)
             self._count(step, pipeline.datamanager.scenes[metrics["scene"]].name, faults)
-        self._update(step, state.gather(gathered, step, every, skip))
+        self._update(step, skip)
         metrics["skipped_steps"] = state.skipped.total()
         if self.config.log_gradients:
             norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
@@ -222,12 +201,12 @@ class PointSplatTrainer(StoppableTrainer):
                 total, most = skipped.total(), self.config.max_skipped_steps
                 CONSOLE.log(f"step {step} is skipped: {name}: {text} ({total} skipped so far; more than {most} stop)")
 
-    def _update(self, step: int, due: list[str]) -> None:
-        """Step the optimisers of the parts of the network that are due for an update, the clock, and all schedules."""
+    def _update(self, step: int, skip: bool) -> None:
+        """Step the optimisers, unless the step is skipped, the clock, and all schedules."""
         self._count_seconds(step)
         scale = self.grad_scaler.get_scale()
-        if due:
-            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, due)
+        if not skip:
+            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
             self.grad_scaler.update()
         if scale <= self.grad_scaler.get_scale():  # as in nerfstudio: not if the scaler skipped the update
             self.optimizers.scheduler_step_all(step)
@@ -246,7 +225,5 @@ class PointSplatTrainer(StoppableTrainer):
 
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio's; all processes call it, the first one writes."""
-        for name in self.pipeline.training_state.waiting:
-            processes.average_gradients(self.optimizers.parameters[name])  # over processes, so that all hold the same
         super().save_checkpoint(step)
         self._seconds_of_checkpoint = self.pipeline.training_state.seconds

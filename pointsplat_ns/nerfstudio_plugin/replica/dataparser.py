@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -30,13 +29,11 @@ class ReplicaDataParserConfig(DataParserConfig):
     """Scene folder, with traj.txt and results/ (cam_params.json in it or in the folder above), or a sequence with
     traj_w_c.txt and rgb/."""
     frame_stride: int = 1
-    """Use every n-th frame, in the order of their numbers. Frames of eval_frames or eval_list are always used."""
+    """Use every n-th frame, in the order of their numbers. Frames of eval_frames are always used."""
     eval_every: int = 10
     """Hold out every n-th of the used frames for evaluation, the first one included."""
     eval_frames: tuple[int, ...] = ()
     """Hold out these frames instead, by the number in the file name."""
-    eval_list: Path | None = None
-    """Hold out the frames listed in this text file instead: numbers or file names, one per line; # starts a comment."""
     scale_factor: float = 1.0
     """Multiplies the camera positions and the seed points."""
     load_seed_points: bool = True
@@ -111,42 +108,35 @@ class ReplicaDataParser(DataParser):
             value = getattr(config, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise DataError(f"--{name.replace('_', '-')} {value}: expected a positive number")
-        if config.eval_frames and config.eval_list is not None:
-            raise DataError("--eval-frames and --eval-list are both given: expected one of them")
 
     def _split(self, scene: ReplicaScene) -> tuple[list[int], list[int]]:
         """Positions of the training and of the held-out frames in ``scene``."""
         config = self.config
         used = list(range(0, len(scene), config.frame_stride))
-        if config.eval_frames or config.eval_list is not None:
-            wanted, source = list(config.eval_frames), "--eval-frames"
-            if config.eval_list is not None:
-                wanted, source = read_eval_list(config.eval_list), str(config.eval_list)
+        if config.eval_frames:
             position = {number: i for i, number in enumerate(scene.numbers)}
-            unknown = [n for n in wanted if n not in position]
+            unknown = [n for n in config.eval_frames if n not in position]
             if unknown:
                 raise DataError(
-                    f"{source}: frame {unknown[0]} is not among the {len(scene)} usable frames of {scene.folder} "
+                    f"--eval-frames: frame {unknown[0]} is not among the {len(scene)} usable frames of {scene.folder} "
                     f"(numbers {scene.numbers[0]} to {scene.numbers[-1]})"
                 )
-            held_out = sorted({position[n] for n in wanted})
+            held_out = sorted({position[n] for n in config.eval_frames})
         else:
             held_out = used[:: config.eval_every]
         train = sorted(set(used) - set(held_out))
         if not train or not held_out:
             raise DataError(
                 f"{scene.folder}: {len(scene)} usable frames leave {len(train)} for training and {len(held_out)} "
-                "held out; expected at least one of each: change --frame-stride, --eval-every or the list"
+                "held out; expected at least one of each: change --frame-stride, --eval-every or --eval-frames"
             )
         return train, held_out
 
     def _seed_points(self, train: ReplicaScene, principal_point: tuple[float, float]) -> dict[str, torch.Tensor]:
-        from pointsplat_ns.nerfstudio_plugin.replica.dataparser import fuse_depth
-
         if train.depths is None:
             CONSOLE.log(f"{train.folder}: no depth images, so no seed points; training starts from random ones")
             return {}
-        xyz, rgb = fuse_depth(train, self.config.num_seed_points, principal_point, progress=True)
+        xyz, rgb = fuse_depth(train, self.config.num_seed_points, principal_point)
         if len(xyz) == 0:
             CONSOLE.log(f"{train.folder}: no pixel of the depth images is known, so no seed points")
             return {}
@@ -154,27 +144,6 @@ class ReplicaDataParser(DataParser):
             "points3D_xyz": torch.from_numpy(xyz * np.float32(self.config.scale_factor)),
             "points3D_rgb": torch.from_numpy(rgb),
         }
-
-
-def read_eval_list(path: Path) -> list[int]:
-    """Frame numbers from a text file with one ``120``, ``frame000120`` or ``results/frame000120.jpg`` per line. Raises
-    DataError if the file is missing or empty, or a line is not a frame."""
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (FileNotFoundError, IsADirectoryError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a readable text file ({type(error).__name__}); expected frame numbers") from None
-    numbers = []
-    for count, line in enumerate(lines, start=1):
-        name = line.split("#")[0].strip()
-        if not name:
-            continue
-        match = re.fullmatch(r"(?:frame)?(\d+)", Path(name).stem)
-        if match is None:
-            raise DataError(f"{path}: line {count} is {name!r}; expected a frame number or file name")
-        numbers.append(int(match.group(1)))
-    if not numbers:
-        raise DataError(f"{path}: names no frame; expected a frame number or file name a line")
-    return numbers
 
 
 def _scene_box(scene: ReplicaScene, scale: float) -> SceneBox:
@@ -190,7 +159,6 @@ def fuse_depth(
     scene: ReplicaScene,
     num_points: int,
     principal_point: tuple[float, float],
-    progress: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unproject the depth images of training frames and thin them to at most ``num_points`` points: xyz float32 (P, 3)
     in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
@@ -209,7 +177,7 @@ def fuse_depth(
     budget = max(num_points * 40 // len(chosen), 1)
     step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
     all_xyz, all_rgb = [], []
-    shown = progress and len(chosen) >= 20  # fewer take about a second
+    shown = len(chosen) >= 20  # fewer take about a second
     for order, index in enumerate(tracked(chosen, "Seed points from depth", len(chosen), shown)):
         depth = read_depth(depths[index], params)
         valid = _inner(depth)

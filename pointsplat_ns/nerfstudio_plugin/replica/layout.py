@@ -1,4 +1,4 @@
-"""Reads and checks scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF.
+"""Reads scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF.
 
 NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
 axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
@@ -13,24 +13,23 @@ degrees, which no file says; a ``cam_params.json`` overrides it.
 nerfstudio is not imported.
 """
 
+import json
 import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import read_text
+from pointsplat_ns.io.files import one_line, read_text
 from pointsplat_ns.io.pictures import exif_hint
-from pointsplat_ns.nerfstudio_plugin.replica.cam_params import (
-    FARTHEST,
-    PinholeParams,
-    cam_params_paths,
-    read_cam_params,
-)
 
 logger = logging.getLogger(__name__)
+
+FARTHEST = 1e18
+"""Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,42 @@ def file_names(folder: Path) -> FileNames | None:
 
 
 @dataclass(frozen=True)
+class PinholeParams:
+    """Intrinsics as in ``cam_params.json``, without a pixel-centre correction.
+
+    Attributes:
+        width, height: Image size in pixels.
+        fx, fy, cx, cy: Focal lengths and principal point in pixels.
+        scale: Raw depth counts per scene unit.
+        path: The file they come from.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    scale: float
+    path: Path
+
+    def principal_point(self, centers: Literal["auto", "integer", "half"] = "auto") -> tuple[float, float]:
+        """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
+
+        There are two conventions. ``integer``: the centre of the first pixel is 0, so the middle of an image 1200 wide
+        is 599.5, as in Replica's own file and in OpenCV; half a pixel is added. ``half``: coordinates start at the
+        corner of the image, whose middle is then w / 2; nothing is added. ``auto`` chooses ``half`` if the principal
+        point is exactly (w / 2, h / 2), and ``integer`` otherwise.
+        """
+        if centers == "auto":
+            centers = "half" if (self.cx, self.cy) == (self.width / 2, self.height / 2) else "integer"
+        shift = 0.5 if centers == "integer" else 0.0
+        return self.cx + shift, self.cy + shift
+
+
+@dataclass(frozen=True)
 class ReplicaScene:
-    """A checked scene: paths and numbers, no pixels.
+    """A scene: paths and numbers, no pixels.
 
     Attributes:
         folder: The scene folder.
@@ -100,9 +133,8 @@ class ReplicaScene:
         )
 
 
-def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
-    """Read and check a scene. Image headers are read, but no image is decoded; with ``check_sizes``, every photo's size
-    is compared with ``cam_params.json``.
+def load_replica(folder: Path) -> ReplicaScene:
+    """Read a scene. No photo is opened, except for the size of those of Semantic-NeRF.
 
     Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking), are dropped, with one warning. A
     DataError names a file that is missing, unreadable or inconsistent.
@@ -119,64 +151,62 @@ def load_replica(folder: Path, check_sizes: bool = True) -> ReplicaScene:
         hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else hint
         raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
     trajectory = folder / names.trajectory
-    photos = _numbered(folder / names.photos, names.photo, f"photos such as {names.example}")
+    photos, depths = _numbered(folder / names.photos, names.photo), _numbered(folder / names.depths, names.depth)
     if not photos:
         raise DataError(f"{folder / names.photos}: no photo found; expected {names.example} and so on")
-    has_depths = (folder / names.depths).is_dir()
-    depths = _numbered(folder / names.depths, names.depth, "depth images") if has_depths else {}
     numbers = sorted(photos)
     params = _params(folder, names, photos[numbers[0]])
     poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
+        missing = [n for n in range(numbers[0], numbers[0] + len(poses)) if n not in photos]
         raise DataError(
-            f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in {folder / names.photos}; "
-            f"expected one line per photo{_missing_hint(numbers, len(poses))}"
+            f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in {folder / names.photos}; expected one line "
+            "per photo" + (f"; no photo has the number {missing[0]}" if missing else "")
         )
-    if depths:
-        missing = [n for n in numbers if n not in depths]
-        if missing:
-            lacking = _some([photos[n].name for n in missing])
-            raise DataError(
-                f"{folder / names.depths}: {len(missing)} of {len(numbers)} photos have no depth image ({lacking}); "
-                "restore them, or remove all depth images to go without depth"
-            )
+    missing = [n for n in numbers if n not in depths] if depths else []
+    if missing:
+        raise DataError(
+            f"{folder / names.depths}: {len(missing)} of {len(numbers)} photos have no depth image (first "
+            f"{photos[missing[0]].name}); restore them, or remove all depth images to go without depth"
+        )
     finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
-    if not finite.all():
-        lines = [int(i) + 1 for i in np.flatnonzero(~finite)]
-        if not finite.any():
-            raise DataError(
-                f"{trajectory}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}"
-            )
-        logger.warning(
-            "%s: %d of %d poses hold NaN, Inf or numbers beyond 1e18 (line %s): their frames are left out",
-            trajectory,
-            len(lines),
-            len(poses),
-            _some([str(i) for i in lines]),
-        )
-    keep = [int(i) for i in np.flatnonzero(finite)]
-    rigid = _rigid(poses[keep], [i + 1 for i in keep], trajectory)
-    numbers = [numbers[i] for i in keep]
-    scene = ReplicaScene(
+    keep, lost = np.flatnonzero(finite).tolist(), (np.flatnonzero(~finite) + 1).tolist()
+    if not keep:
+        raise DataError(f"{trajectory}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}")
+    if lost:
+        some = ", ".join(map(str, lost[:5])) + (" and more" if lost[5:] else "")
+        what = f"{len(lost)} of {len(poses)} poses hold NaN, Inf or numbers beyond {FARTHEST:g}"
+        logger.warning("%s: %s (line %s): their frames are left out", trajectory, what, some)
+    return ReplicaScene(
         folder=folder,
         params=params,
-        numbers=tuple(numbers),
-        photos=tuple(photos[n] for n in numbers),
-        depths=tuple(depths[n] for n in numbers) if depths else None,
-        poses=rigid,
+        numbers=tuple(numbers[i] for i in keep),
+        photos=tuple(photos[numbers[i]] for i in keep),
+        depths=tuple(depths[numbers[i]] for i in keep) if depths else None,
+        poses=_rigid(poses[keep], [i + 1 for i in keep], trajectory),
     )
-    if check_sizes:
-        for path in scene.photos:
-            _check_size(path, _open_image(path).size, params)
-    return scene
 
 
 def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
-    """Intrinsics of a scene: those of its file, or those that all sequences of Semantic-NeRF have."""
-    if names is SEMANTIC_NERF and not any(path.is_file() for path in cam_params_paths(folder)):
-        width, height = _open_image(photo).size
+    """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it, or those that all sequences
+    of Semantic-NeRF have. Raises DataError if there are none, or a number is missing or out of range."""
+    places = folder / "cam_params.json", folder.absolute().parent / "cam_params.json"
+    wanted = 'expected {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}'
+    path = next((place for place in places if place.is_file()), None)
+    if path is None and names is SEMANTIC_NERF:
+        width, height = _opened(photo).size
         return PinholeParams(width, height, width / 2, width / 2, (width - 1) / 2, (height - 1) / 2, 1000.0, photo)
-    return read_cam_params(folder)
+    if path is None:
+        raise DataError(f"{places[0]}: not found, nor {places[1]}; {wanted} in one of them")
+    try:
+        camera = json.loads(read_text(path))["camera"]
+        w, h, fx, fy, cx, cy, scale = (float(camera[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{path}: {type(error).__name__}: {one_line(error)}; {wanted}") from None
+    positive = all(0 < value < FARTHEST for value in (w, h, fx, fy, scale)) and abs(cx) + abs(cy) < FARTHEST
+    if not positive or w % 1 or h % 1:  # NaN fails too
+        raise DataError(f"{path}: {camera!s:.200}; {wanted} with positive numbers, whole ones of pixels")
+    return PinholeParams(int(w), int(h), fx, fy, cx, cy, scale, path)
 
 
 def read_trajectory(path: Path) -> np.ndarray:
@@ -205,40 +235,39 @@ def read_trajectory(path: Path) -> np.ndarray:
 
 
 def read_photo(path: Path, params: PinholeParams) -> np.ndarray:
-    """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing or broken, not of 8 bits a channel, or of
-    another size than ``params``."""
-    image = _open_image(path)
-    _check_size(path, image.size, params)
-    if image.mode.startswith(("I", "F")):
-        raise DataError(f"{path}: pixels of mode {image.mode}; expected 8 bits a channel; convert the photo")
-    return np.asarray(_decoded(path, image).convert("RGB"))
+    """One photo, uint8 (H, W, 3), sRGB. Raises DataError if it is missing, broken or of another size than
+    ``params``."""
+    return np.asarray(_decoded(path, params).convert("RGB"))
 
 
 def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
     """One depth image, float32 (H, W), scene units along the optical axis, 0 where unknown. Raises DataError if it is
     missing or broken, not of 16 bits, or of another size than ``params``."""
-    image = _open_image(path)
-    _check_size(path, image.size, params)
+    image = _decoded(path, params)
     if image.mode not in ("I;16", "I;16B", "I"):
         raise DataError(f"{path}: pixels of mode {image.mode}; expected a 16-bit grey depth image")
-    raw = np.asarray(_decoded(path, image)).astype(np.int64)
+    raw = np.asarray(image).astype(np.int64)
     depth = raw.astype(np.float32) / np.float32(params.scale)
     depth[np.isin(raw, (0, 65535))] = 0.0  # empty and saturated: not measured
     return depth
 
 
-def _open_image(path: Path):
-    from PIL import Image, UnidentifiedImageError
+def _opened(path: Path) -> Any:
+    from PIL import Image
 
     try:
         return Image.open(path)
-    except FileNotFoundError:
-        raise DataError(f"{path}: not found") from None
-    except (UnidentifiedImageError, OSError) as error:
+    except OSError as error:
         raise DataError(f"{path}: not a readable picture ({type(error).__name__}); restore the file") from None
 
 
-def _decoded(path: Path, image):
+def _decoded(path: Path, params: PinholeParams) -> Any:
+    image, wanted = _opened(path), (params.width, params.height)
+    if image.size != wanted:
+        raise DataError(
+            f"{path}: {image.width} x {image.height} pixels; expected {wanted[0]} x {wanted[1]} as in {params.path}"
+            + exif_hint(path, wanted)
+        )
     try:
         image.load()
     except (OSError, SyntaxError, ValueError) as error:
@@ -246,20 +275,10 @@ def _decoded(path: Path, image):
     return image
 
 
-def _check_size(path: Path, size: tuple[int, int], params: PinholeParams) -> None:
-    if size != (params.width, params.height):
-        raise DataError(
-            f"{path}: {size[0]} x {size[1]} pixels; expected {params.width} x {params.height} as in {params.path}"
-            + exif_hint(path, (params.width, params.height))
-        )
-
-
-def _numbered(folder: Path, pattern: str, wanted: str) -> dict[int, Path]:
-    """The files of a folder whose names match, by the number in the name."""
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; expected {wanted} in it")
+def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """The files of a folder whose names match, by the number in the name; none if there is no such folder."""
     found: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.glob("*")):
         match = re.fullmatch(pattern, path.name, re.IGNORECASE)
         if match is None:
             continue
@@ -270,39 +289,19 @@ def _numbered(folder: Path, pattern: str, wanted: str) -> dict[int, Path]:
     return found
 
 
-def _missing_hint(numbers: list[int], poses: int) -> str:
-    """Names the photos that are missing in the numbering, if that explains the difference in count."""
-    last = max(numbers[0] + poses - 1, numbers[-1])
-    if len(numbers) >= poses or last - numbers[0] + 1 != poses:
-        return ""
-    present = set(numbers)
-    gaps = [f"frame{n:06d}" for n in range(numbers[0], last + 1) if n not in present]
-    return f"; missing: {_some(gaps)}"
-
-
-def _some(items: list[str], limit: int = 5) -> str:
-    return ", ".join(items[:limit]) + (f" and {len(items) - limit} more" if len(items) > limit else "")
-
-
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:
-    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). Raises DataError if the
-    last row is not (0, 0, 0, 1), the drift is too large, or the axes are mirrored."""
-    last = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1)
+    """Poses with each rotation replaced by the nearest orthonormal one (polar factor, by SVD). Raises DataError if a
+    matrix is no rotation and position, such as one written column by column. Few digits cause a drift of 1e-7 to 1e-4;
+    beyond one percent the matrix holds a scale or a shear."""
     rotation = poses[:, :3, :3]
-    drift = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
-    mirrored = np.linalg.det(rotation) < 0
-    for k, line in enumerate(lines):
-        if last[k] > 1e-6:
-            row = " ".join(f"{v:g}" for v in poses[k, 3])
-            raise DataError(f"{path}: line {line} ends in {row}; expected 0 0 0 1 (a matrix written row by row)")
-        # Few digits cause a drift of 1e-7 to 1e-4. Beyond one percent the matrix holds a scale or a shear.
-        if drift[k] > 1e-2:
-            raise DataError(
-                f"{path}: line {line} is not a rigid pose (R^T R is off by {drift[k]:.2g}); "
-                "expected a rotation within 0.01"
-            )
-        if mirrored[k]:
-            raise DataError(f"{path}: line {line} mirrors the axes (determinant -1); expected a rotation")
+    sound = np.abs(poses[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) <= 1e-6
+    sound &= np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2)) <= 1e-2
+    sound &= np.linalg.det(rotation) > 0
+    if not sound.all():
+        raise DataError(
+            f"{path}: line {lines[int(np.argmin(sound))]} is no rigid pose; expected a rotation, within 0.01, a "
+            "position and the last row 0 0 0 1, row by row"
+        )
     u, _, vt = np.linalg.svd(rotation)
     rigid = np.tile(np.eye(4), (len(poses), 1, 1))
     rigid[:, :3, :3] = u @ vt

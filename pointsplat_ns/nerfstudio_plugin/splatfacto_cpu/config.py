@@ -33,12 +33,6 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
     """If the run is shorter than 30,000 steps, shorten Splatfacto's schedules (resolution, SH degree, densification,
     learning rates) in proportion, let learning rates begin higher, and the scene grow to fewer Gaussians. Options set
     by hand are not changed."""
-    early_look: bool = True
-    """Say after some seconds how long the training will take, and draw a held-out photo and its render now and then, in
-    the folder pictures of the run."""
-    max_skipped_in_a_row: int = 10
-    """Number of steps in a row that may be skipped because their loss or gradients are not finite, before training
-    stops and names the photos. One broken photo among sound ones stops nothing."""
 
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose schedules are fitted."""

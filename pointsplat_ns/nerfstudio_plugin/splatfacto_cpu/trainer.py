@@ -10,22 +10,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.early_look import EarlyLook
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
 from pointsplat_ns.system.tensors import FLOATS
@@ -33,6 +31,10 @@ from pointsplat_ns.system.tensors import FLOATS
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
+
+MOST_SKIPPED_IN_A_ROW = 10
+"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
+and names the photos. One broken photo among sound ones stops nothing."""
 
 _LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
 """Attributes of the datamanager: the frames that are still to come before any is repeated."""
@@ -114,7 +116,7 @@ class CheckingOptimizers(Optimizers):
 
 
 class SplatfactoCpuTrainer(StoppableTrainer):
-    """nerfstudio's trainer, which can be stopped at any time and tells early how long it takes and what comes of it.
+    """nerfstudio's trainer, which can be stopped at any time and skips steps that are not finite.
 
     A step whose loss or gradients are not finite changes neither parameters nor the optimisers' state nor what
     densification gathers. It is counted, and the log names its photo. The learning-rate schedules still advance.
@@ -129,24 +131,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         """Number of steps that were skipped, by photo."""
         self._skipped_in_a_row = 0
 
-    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's. Raises PointSplatError if the data cannot be used, or ``max_skipped_in_a_row`` is
-        negative."""
-        if self.config.max_skipped_in_a_row < 0:
-            raise PointSplatError(f"--max-skipped-in-a-row {self.config.max_skipped_in_a_row}: expected at least 0")
-        super().setup(test_mode)
-        if self.config.early_look and test_mode == "val":
-            pictures = self.base_dir / "pictures"
-            look = EarlyLook(self.pipeline, pictures, self._start_step, self.config.max_num_iterations)
-
-            def after_training(step: int) -> None:
-                with self.train_lock:  # as nerfstudio holds it in a step: the viewer's threads draw with the same model
-                    look.after_training(step)
-
-            before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
-            self.callbacks.append(TrainingCallback([before], look.before_step, update_every_num_iters=1))
-            self.callbacks.append(TrainingCallback([after], after_training, update_every_num_iters=1))
-
     def train(self) -> None:
         """As nerfstudio's."""
         with tiny_as_zero():
@@ -158,11 +142,11 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """As nerfstudio's, but skips a step whose loss or gradients are not finite. If more than
-        ``max_skipped_in_a_row`` have been skipped without one between that was not, a checkpoint is saved, and a
+        :data:`MOST_SKIPPED_IN_A_ROW` have been skipped without one between that was not, a checkpoint is saved, and a
         DataError ends training."""
         loss, losses, metrics = super().one_step(step)
         metrics["skipped_steps"] = self.skipped.total()
-        if self._skipped_in_a_row > self.config.max_skipped_in_a_row:
+        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
             self._stop(step)
         return loss, losses, metrics
 

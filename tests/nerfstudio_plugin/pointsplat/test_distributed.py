@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from unittest import mock
@@ -20,15 +22,14 @@ from pointsplat_ns.compression import feedback_training
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
-from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks, synchronise_batch_norm
+from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.refiner.layers import BatchNorm
-from pointsplat_ns.system.processes import average_gradients, gathered, torchrun_rank
+from pointsplat_ns.system.processes import average_gradients, gathered
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
 UPDATES = 2
-ROWS, CHANNELS = 10, 4
 BROKEN = {3}, {6}
 """Places of a broken photo, which the second process meets, and of a broken gradient, which the first does."""
 
@@ -68,7 +69,7 @@ def train(config, world_size: int = 1, judged: bool = False) -> dict:
     return {
         "losses": losses,
         "psnr": quality,
-        "gradients": {name: p.grad.clone() for name, p in refiner.named_parameters()},
+        "gradients": {name: p.grad.clone() for name, p in refiner.named_parameters() if p.grad is not None},
         "weights": {name: p.detach().clone() for name, p in refiner.named_parameters()},
         "report": {name: block["refined"]["psnr"] for name, block in report["scenes"].items()},
         "skipped": dict(trainer.pipeline.training_state.skipped),
@@ -76,20 +77,36 @@ def train(config, world_size: int = 1, judged: bool = False) -> dict:
     }
 
 
-def gathering(data: Path, output_dir: Path, steps: int, accumulate: int):
-    """The config of a training that updates once in some steps, and saves between two updates as well."""
+def saving(data: Path, output_dir: Path, steps: int):
+    """The config of a training that saves every second step."""
     config = config_of(data, output_dir, steps)
-    config.gradient_accumulation_steps = {"all": accumulate}
     config.steps_per_save, config.save_only_latest_checkpoint = 2, False
     return config
 
 
 def resumed(rooms: Path, folder: Path, name: str, rank: int) -> list[dict]:
-    """A training of two processes, and the end of it once more from a checkpoint between two updates."""
-    whole = train(gathering(rooms, folder / f"{name}{rank}", 4, 2), world_size=2)
-    rest = gathering(rooms, folder / f"{name} on {rank}", 1, 2)
+    """A training of two processes, and the end of it once more from a checkpoint."""
+    whole = train(saving(rooms, folder / f"{name}{rank}", 4), world_size=2)
+    rest = saving(rooms, folder / f"{name} on {rank}", 1)
     rest.load_dir, rest.load_step = folder / f"{name}0" / "refiner" / "pointsplat" / "now" / "nerfstudio_models", 2
     return [whole, train(rest, world_size=2)]
+
+
+@contextmanager
+def two_scenes_a_step() -> Iterator[None]:
+    """Within, a step of one process takes the scenes of the two processes, and the mean of their losses."""
+    one = PointSplatPipeline.get_train_loss_dict
+
+    def both(self, step):
+        parts = [one(self, place) for place in (2 * step, 2 * step + 1)]
+        _, losses, metrics = zip(*parts, strict=True)
+        means = {name: (losses[0][name] + losses[1][name]) / 2 for name in losses[0]}
+        metrics[0]["psnr"] = (metrics[0]["psnr"] + metrics[1]["psnr"]) / 2
+        metrics[0]["faults"] += metrics[1]["faults"]
+        return {}, means, metrics[0]
+
+    with mock.patch.object(PointSplatPipeline, "get_train_loss_dict", both):
+        yield
 
 
 def timed(rooms: Path, folder: Path, rank: int) -> dict:
@@ -98,16 +115,6 @@ def timed(rooms: Path, folder: Path, rank: int) -> dict:
     config.seconds = 25.0
     with mock.patch.object(PointSplatTrainer, "clock", count(0.0, 1000.0 if rank else 10.0).__next__):
         return train(config, world_size=2)
-
-
-def normalise(norm: nn.Module, x: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Two steps of a batch norm in training, the gradients of a weighted sum of what comes out, and its statistics."""
-    x = x.clone().requires_grad_()
-    norm(2 * x.detach())
-    out = norm(x)
-    (out * weights).sum().backward()
-    found = {"out": out.detach(), "x": x.grad, "weight": norm.weight.grad, "bias": norm.bias.grad}
-    return found | {name: value.clone() for name, value in norm.named_buffers()}
 
 
 def feedback(file: Path) -> list[torch.Tensor]:
@@ -119,13 +126,6 @@ def feedback(file: Path) -> list[torch.Tensor]:
     return [value.detach() for value in network.parameters()]
 
 
-def rows() -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of two scenes of different sizes, far from zero, and weights for the loss."""
-    generator = torch.Generator().manual_seed(7)
-    x = torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64) + 100
-    return x, torch.randn(ROWS, CHANNELS, generator=generator, dtype=torch.float64)
-
-
 def work(rank: int, folder: Path) -> None:
     """What each of the two processes does."""
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
@@ -133,17 +133,11 @@ def work(rank: int, folder: Path) -> None:
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
         found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank)
     found["timed"] = timed(folder / "rooms", folder, rank)
-    x, weights = rows()
-    mine = slice(0, 3) if rank == 0 else slice(3, ROWS)
-    norm = nn.Sequential(BatchNorm(CHANNELS).double())
-    synchronise_batch_norm(norm)
-    found["norm"] = normalise(norm[0], x[mine], weights[mine])
-    found["norm of a point"] = norm[0](x[rank : rank + 1]).detach()
     found["gathered"] = gathered([rank, "x"])
     found["means"] = means_over_ranks({"l1": torch.tensor(1.0 + rank), "only": torch.tensor(5.0)}, ("l1", "lpips"))
     one, none = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3))
     one.grad = torch.full((2,), 1.0 + rank) if rank else None
-    average_gradients([one, none], steps=4)
+    average_gradients([one, none])
     found["averaged"] = (one.grad, none.grad)
     found["feedback"] = feedback(folder / f"feedback{rank}.safetensors")
     torch.save(found, folder / f"found{rank}.pt")
@@ -161,12 +155,10 @@ def together(tmp_path_factory):
         env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, REPOSITORY / "tests/support")))},
     )  # fmt: skip
     try:
-        alone = config_of(folder / "rooms", folder / "alone", 2 * UPDATES)
-        alone.gradient_accumulation_steps = {"all": 2}
-        alone = train(alone, judged=True)
-        # What either of two processes cannot use, both leave out.
-        with broken("nan", BROKEN[0] | {2}), broken("gradient", BROKEN[1] | {7}):
-            alone["skipping"] = train(gathering(folder / "rooms", folder / "skipping", 8, 4))
+        with two_scenes_a_step():
+            alone = train(config_of(folder / "rooms", folder / "alone", UPDATES), judged=True)
+        with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]), two_scenes_a_step():
+            alone["skipping"] = train(saving(folder / "rooms", folder / "skipping", 4))
         alone["feedback"] = feedback(folder / "feedback.safetensors")
         text = pair.communicate(timeout=600)[0].decode()
     finally:
@@ -181,9 +173,8 @@ def together(tmp_path_factory):
 def test_losses_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
     found, alone = together
     for key, tolerance in (("losses", 1e-5), ("psnr", 1e-5)):  # float32 sums in another order, through three updates
-        wanted = [(a + b) / 2 for a, b in zip(alone[key][::2], alone[key][1::2], strict=True)]
-        assert found[0][key] == found[1][key] == pytest.approx(wanted, rel=tolerance)
-    assert len(set(alone["losses"])) == 2 * UPDATES
+        assert found[0][key] == found[1][key] == pytest.approx(alone[key], rel=tolerance)
+    assert len(set(alone["losses"])) == UPDATES and len(alone["gradients"]) == len(alone["weights"])
     for key, tolerance in (("gradients", 1e-3), ("weights", 1e-3)):
         for name, wanted in alone[key].items():
             assert torch.equal(found[0][key][name], found[1][key][name]), name
@@ -191,6 +182,12 @@ def test_losses_gradients_and_weights_are_those_of_one_process_with_twice_the_ba
             # gradient is nearly nothing. Shares of the tensor's largest value.
             error = (found[0][key][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
             assert error < tolerance, (key, name, float(error))
+
+
+def test_values_and_gradients_are_means_over_the_processes_that_have_them(together):
+    for part in together[0]:
+        assert part["gathered"] == [0, "x", 1, "x"] and part["means"] == {"l1": torch.tensor(1.5)}
+        assert [grad.tolist() for grad in part["averaged"]] == [[1.0, 1.0], [0.0, 0.0, 0.0]]
 
 
 def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
@@ -209,10 +206,9 @@ def test_processes_share_the_repairs_that_a_feedback_refiner_learns_from(togethe
     assert [part["feedback written"] for part in found] == [True, False]
 
 
-def test_a_training_interrupted_between_two_updates_ends_as_an_unbroken_one(together):
+def test_an_interrupted_training_ends_as_an_unbroken_one(together):
     for part in together[0]:
         whole, rest = part["skipping"]
-        assert f"step-{2:09d}.ckpt" in together[0][0]["skipping"][0]["files"], "it was saved with gradients in waiting"
         assert str(rest["losses"]) == str(whole["losses"][3:]) and rest["skipped"] == whole["skipped"]
         for tensor, value in whole["weights"].items():
             assert torch.equal(rest["weights"][tensor], value), tensor
@@ -230,40 +226,13 @@ def test_what_one_process_cannot_use_all_leave_out(together):
             error = (whole["weights"][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
             assert error < 1e-3, (name, float(error))  # as above
     assert found[0]["skipping"][0]["skipped"] == found[1]["skipping"][0]["skipped"]
-    assert sum(alone["skipping"]["skipped"].values()) == 4
+    assert sum(alone["skipping"]["skipped"].values()) == 2
 
 
 def test_the_first_process_says_when_the_time_is_over(together):
     ours, theirs = (part["timed"] for part in together[0])
     assert len(ours["losses"]) == len(theirs["losses"]) == 3
     assert f"step-{2:09d}.ckpt" in ours["files"]
-
-
-def test_batch_norm_is_that_of_all_points(together):
-    found, _ = together
-    x, weights = rows()
-    # each process's loss is its own; the mean of their gradients is that of the mean loss
-    wanted = normalise(BatchNorm(CHANNELS).double(), x, weights)
-    parts = [part["norm"] for part in found]
-    tight = {"rtol": 1e-9, "atol": 1e-9}  # float64
-    for name in ("out", "x"):
-        torch.testing.assert_close(torch.cat([part[name] for part in parts]), wanted[name], **tight)
-    for name in ("weight", "bias"):
-        torch.testing.assert_close(parts[0][name] + parts[1][name], wanted[name], **tight)
-    for part in parts:
-        for name in ("running_mean", "running_var", "num_batches_tracked"):
-            torch.testing.assert_close(part[name], wanted[name], **tight)
-    pair = BatchNorm(CHANNELS).double()(x[:2]).detach()
-    torch.testing.assert_close(torch.cat([part["norm of a point"] for part in found]), pair, **tight)
-
-
-def test_only_torchrun_sets_the_part_of_a_process(monkeypatch):
-    monkeypatch.setenv("RANK", "3")  # as some schedulers do
-    monkeypatch.setenv("WORLD_SIZE", "4")
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    assert torchrun_rank() == (0, 1)
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
-    assert torchrun_rank() == (3, 4)
 
 
 def test_ns_train_under_torchrun_is_one_training(tmp_path):
@@ -292,6 +261,12 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
     with pytest.raises(PointSplatError, match="torchrun --nproc-per-node 2 --no-python ns-train pointsplat"):
         config.set_timestamp()
     with pytest.raises(SceneError, match="2 processes are asked for and 1 are connected"):
+        config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
+    config.pipeline.model.norm = "batch"
+    with (
+        mock.patch("pointsplat_ns.system.processes.world_size", return_value=2),
+        pytest.raises(SceneError, match="--pipeline.model.norm batch: .*expected scene or layer"),
+    ):
         config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
 
 

@@ -118,11 +118,8 @@ def test_every_option_of_the_model_is_read_in_a_training(trained_walls, no_lpips
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"lpips_weight": 0.0, "lpips_net": "vgg"}, "lpips-net vgg: at --pipeline.model.lpips-weight 0"),
         ({"lpips_weight": -0.1}, "lpips-weight -0.1: expected a finite number, 0 or above"),
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
-        ({"backend": "gsplat", "compiled": True}, "compiled True: has no effect on --pipeline.model.backend gsplat"),
-        ({"backend": "gsplat", "quality": "fast"}, "quality fast: has no effect on --pipeline.model.backend gsplat"),
         ({"by": "merge", "opacity_weight": 0.3}, "opacity weight 0.3: merge does not weigh opacity"),
         ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
         ({"by": "beauty"}, "no method is called 'beauty'; expected one of merge"),
@@ -160,7 +157,6 @@ def test_the_refiner_command_holds_the_unseen_rooms_out():
     assert manager.eval_scenes == tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     assert (manager.supervision, manager.seed) == ("dense", 3)
     assert model.keep == RECIPE.keep and model.size == "tiny" and model.by == "merge"
-    assert model.pruned_folder == Path("o/pruned")
 
 
 LPIPS_WEIGHTS = SHARED_DATA / "weights"

@@ -70,6 +70,8 @@ def test_an_unknown_dataparser_and_an_unknown_setting_are_refused(wall_config, w
     )
     with pytest.raises(SceneError, match="config.yml: trained with the dataparser json.JSONDecoder.*not installed"):
         dataparser_of(open_run(run))
+    config.write_text(text.replace("frame_stride: 1", "frame_stride: 1\n      an_option_of_then: null"))
+    assert dataparser_of(open_run(run)).config.frame_stride == 1, "what was not given need not exist any more"
     config.write_text(text.replace("frame_stride:", "frame_leap:"))
     with pytest.raises(SceneError, match="config.yml: its dataparser has no setting 'frame_leap'"):
         dataparser_of(open_run(run))

@@ -1,4 +1,4 @@
-"""Training across scenes without photos: dense supervision, exact resuming, accumulation, rates and schedules."""
+"""Training across scenes without photos: dense supervision, exact resuming, rates and schedules."""
 
 import json
 import math
@@ -12,7 +12,6 @@ import torch
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
 from making import dense_config, equal
-from pointsplat_ns.errors import PointSplatError
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +79,15 @@ def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained
 def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken_one(
     three_rooms, run_training, tmp_path
 ):
-    stop, accumulate, schedule, skipped = 4, 3, "step", {1, 4, 6}
+    stop, schedule, skipped = 4, "step", {1, 4, 6}
 
     def config(name, steps):
         changed = dense_config(three_rooms, tmp_path / name, steps)
-        changed.gradient_accumulation_steps, changed.schedule = {"all": accumulate}, schedule
+        changed.schedule = schedule
         changed.steps_per_save, changed.save_only_latest_checkpoint = stop, False
         return changed
 
-    with broken("nan", skipped):  # of three updates over three steps, two are the mean of fewer
+    with broken("nan", skipped):
         whole, losses = run_training(config("whole", 8))
         rest = config("rest", 8 - stop - 1)
         rest.load_dir, rest.load_step = whole.checkpoint_dir, stop
@@ -101,8 +100,6 @@ def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken
     assert equal(one.model.refiner.state_dict(), other.model.refiner.state_dict())
     rates = [t.optimizers.optimizers["means"].param_groups[0]["lr"] for t in (whole, resumed)]
     assert rates[0] == rates[1]
-    state = torch.load(whole.checkpoint_dir / f"step-{stop:09d}.ckpt", weights_only=True)["pipeline"]["_extra_state"]
-    assert "gradients" in state, "those that wait for their update are saved"
 
 
 def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(three_rooms):
@@ -119,35 +116,3 @@ def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(thr
         index, frames = pipeline.datamanager.next_train(3)
         torch.manual_seed(5)
         assert float(pipeline.model.losses(index, frames)[1]["l1"].detach()) != first[3], "proves too little"
-
-
-def test_accumulated_gradients_are_averaged_before_they_are_clipped(three_rooms, run_training, tmp_path):
-    pipeline = dense_config(three_rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val").train()
-    for step in range(2):
-        (0.5 * pipeline.get_train_loss_dict(step)[1]["l1"]).backward()
-    means = {n: [p.grad for p in group] for n, group in pipeline.get_param_groups().items() if n != "encoder"}
-    norms = {n: float(torch.cat([g.reshape(-1) for g in grads]).norm()) for n, grads in means.items()}
-    assert min(norms["means"], norms["scales"]) > 1e-5, "proves too little"
-    config = dense_config(three_rooms, tmp_path, 2)
-    config.gradient_accumulation_steps = {"all": 2}
-    # of the mean's norm: above it, but below the sum's; and below
-    factors = dict.fromkeys(norms, 1.5) | {"scales": 0.5}
-    for name, factor in factors.items():
-        config.optimizers[name]["optimizer"].max_norm = factor * norms[name]
-    trainer, _ = run_training(config)
-    groups = trainer.pipeline.get_param_groups()
-    for name, grads in means.items():
-        for p, mean in zip(groups[name], grads, strict=True):
-            wanted = mean * min(1.0, factors[name])
-            # float32: a half taken before the sum, and after it; the norm itself is float32
-            torch.testing.assert_close(p.grad, wanted, rtol=1e-3, atol=1e-7)
-
-
-@pytest.mark.parametrize("steps", [{"hands": 2}, {"encoder": 0}])
-def test_an_accumulation_that_means_nothing_is_refused_and_leaves_no_folder(three_rooms, tmp_path, steps):
-    config = dense_config(three_rooms, tmp_path / "outputs", 1)
-    config.gradient_accumulation_steps = steps
-    config.save_config()
-    with pytest.raises(PointSplatError, match="--gradient-accumulation-steps .*expected all or one of encoder"):
-        config.setup(local_rank=0, world_size=1).setup()
-    assert not (tmp_path / "outputs").exists()

@@ -1,4 +1,4 @@
-"""What makes a training vary (budgets, transforms, rates that fit), and pruned scenes kept on disk."""
+"""What makes a training vary (budgets, transforms, rates that fit)."""
 
 import math
 
@@ -9,12 +9,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, move_zero_layers, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedKey, read_pruned, stored_path, write_pruned
-from pointsplat_ns.pruning import PruneSettings
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import pruned_key
 
 
 def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(trained_walls, tmp_path):
@@ -23,7 +21,7 @@ def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(tra
     model, cache = pipeline.model, pipeline.datamanager.cache
 
     def met(keep: float) -> bool:
-        return any(cache.get(PrunedKey(s.name, model.config.prune_settings(keep))) for s in model.scenes)
+        return any(cache.get(pruned_key(s, model.config.prune_settings(keep))) for s in model.scenes)
 
     for step in range(40):
         pipeline.get_train_loss_dict(step)
@@ -63,39 +61,6 @@ def test_each_network_trains_and_its_run_opens_again(trained_walls, run_training
         assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
     settings = again.get_average_eval_image_metrics()["settings"]
     assert all(settings[name] == value for name, value in changes.items())
-
-
-def test_pruned_scenes_are_taken_from_the_folder(trained_walls, tmp_path, monkeypatch):
-    def pruned(**changes):
-        config = small_config(trained_walls, tmp_path, 1, pruned_folder=tmp_path / "pruned", **changes)
-        return config.pipeline.setup(device="cpu", test_mode="test").model.pruned_scene(0)
-
-    first = pruned()
-    files = sorted((tmp_path / "pruned").iterdir())
-    assert len(files) == 1 and files[0].suffix == ".safetensors"
-    with monkeypatch.context() as patch:
-        patch.setattr(PruneSettings, "prune", lambda *a, **k: pytest.fail("pruned again"))
-        second = pruned()
-    assert all(torch.equal(a, b) for a, b in zip(first.pruned.tensors(), second.pruned.tensors(), strict=True))
-    assert (first.dense_count, first.seconds) == (second.dense_count, second.seconds)
-    assert len(pruned(keep=0.25).pruned) < len(first.pruned)  # another budget is another file
-    assert len(list((tmp_path / "pruned").iterdir())) == 2
-
-
-def test_files_of_pruned_scenes_that_are_damaged_or_of_another_kind_say_so(tmp_path):
-    from safetensors.torch import save_file
-
-    scene = Gaussians.empty(sh_degree=1).replace(antialiased=True)
-    path = stored_path(tmp_path, "room", "a5" * 32, PruneSettings(0.5, "paper"))
-    write_pruned(path, scene, 7, 0.25)
-    found, count, seconds = read_pruned(path)
-    assert (len(found), found.sh_degree, found.antialiased, count, seconds) == (0, 1, True, 7, 0.25)
-    path.write_bytes(path.read_bytes()[:-3] + b"x")
-    with pytest.raises(SceneError, match="not a readable pruned scene"):
-        read_pruned(path)
-    save_file({"means": torch.zeros(1, 3)}, path)
-    with pytest.raises(SceneError, match="format None; expected 'pointsplat-pruned/1'"):
-        read_pruned(path)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])

@@ -148,7 +148,7 @@ def test_a_capped_training_is_the_same_on_two_threads_and_does_not_go_on_under_a
     means = []
     for threads in (1, 2):
         config = capped_config(tmp_path / str(threads), 22, 400)
-        config.threads, config.early_look = threads, False
+        config.threads = threads
         means.append(run_training(config)[0].pipeline.model.means)
     assert torch.equal(*means)
     rest = capped_config(tmp_path / "rest", 3, 399)
