@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pointsplat_ns.compression import feedback_training
-from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.feedback_training import (
+from lab import feedback_training
+from lab.feedback_training import (
     FeedbackTrainingSettings,
     TrainingScene,
     roll_out,
     train_feedback,
 )
+from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians

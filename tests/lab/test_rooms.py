@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
+from lab.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
+from lab.rooms.raycast import Solids, chart_points, occluded, surface, trace
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
-from pointsplat_ns.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
-from pointsplat_ns.rooms.raycast import Solids, chart_points, occluded, surface, trace
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
 
@@ -46,7 +46,7 @@ def poses(room):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, coarser_light):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pointsplat_ns.rooms.write.make_room", room_of)
+        patch.setattr("lab.rooms.write.make_room", room_of)
         return write_room(
             tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False
         )
