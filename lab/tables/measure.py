@@ -217,7 +217,7 @@ def paper_dataset(run: Run) -> str:
         except DataError:
             return ""
         size = (scene.params.width, scene.params.height)
-        # The rooms that this package makes may have the same names, but not this size and number.
+        # Drawn rooms (lab/rooms) may have the same names, but not this size and number.
         return "Replica" if size == (1200, 680) and len(scene) == 2000 else ""
     # By the dataset's own files, or by the COLMAP model among them, as the paper's authors read it.
     parsers = {"SeededScanNetppDataParserConfig", "ScanNetppDataParserConfig", "ColmapDataParserConfig"}

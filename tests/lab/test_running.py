@@ -84,7 +84,7 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
     assert paper_dataset(replica(tmp_path, "office2")) == "Replica"
     assert paper_dataset(replica(tmp_path, "kitchen", frames=3)) == ""
     assert paper_dataset(replica(tmp_path / "few", "office2", frames=3)) == ""
-    # The rooms that this package makes are of the same layout and may be called the same.
+    # Drawn rooms are of the same layout and may be called the same.
     assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""
     assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
 
