@@ -187,7 +187,7 @@ def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstud
 
 
 def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys):
-    def fail(*_):
+    def fail(*_, **__):
         raise ModuleNotFoundError("No module named 'av'", name="av")
 
     monkeypatch.setattr("pointsplat_ns.info", fail)

@@ -21,12 +21,12 @@ ALLOCATION = 1 << 60
 """Bytes that no machine has."""
 
 
-def deep(*_) -> int:
+def deep(*_, **__) -> int:
     return 1 + deep()
 
 
 def raising(error: BaseException):
-    def fail(*_):
+    def fail(*_, **__):
         raise error
 
     return fail
@@ -39,8 +39,8 @@ def raising(error: BaseException):
         (raising(OSError(28, "No space left on device")), "No space left on device"),
         (raising(OSError("odd\nsecond line")), "odd"),
         (raising(MemoryError()), "not enough memory (MemoryError)"),
-        (lambda *_: torch.empty(ALLOCATION, dtype=torch.uint8), "not enough memory ("),
-        (lambda *_: bytearray(ALLOCATION), "not enough memory (MemoryError)"),
+        (lambda *_, **__: torch.empty(ALLOCATION, dtype=torch.uint8), "not enough memory ("),
+        (lambda *_, **__: bytearray(ALLOCATION), "not enough memory (MemoryError)"),
         (deep, "the input is nested too deeply (maximum recursion depth exceeded"),
     ],
 )
