@@ -39,8 +39,8 @@ class DemoSettings:
     """Training steps of the scene."""
     refiner_steps: int = 40
     """Training steps of the refiner."""
-    timestamp: str = "demo"
-    """Folder name of the runs."""
+    name: str = "demo"
+    """Name of the folders that a second call replaces: those of the capture and the runs."""
 
 
 DEMO = DemoSettings()
@@ -110,9 +110,9 @@ def train_and_judge(output: Path) -> list[Row]:
     import pointsplat_ns as ps
     from pointsplat_ns.io.runs import METHOD_NAMES
 
-    capture, scenes, logs = output / "capture", output / "scenes", output / "logs"
-    trained = scenes / "room" / METHOD_NAMES.scene / DEMO.timestamp
-    refined = output / "refiner" / "room" / METHOD_NAMES.refiner / DEMO.timestamp
+    capture, scenes, logs = output / "capture" / DEMO.name, output / "scenes", output / "logs"
+    trained = scenes / "room" / METHOD_NAMES.scene / DEMO.name
+    refined = output / "refiner" / "room" / METHOD_NAMES.refiner / DEMO.name
     evaluation, exported = output / "evaluation.json", output / "exported"
     for earlier in (capture, trained, refined):
         shutil.rmtree(earlier, ignore_errors=True)
@@ -123,7 +123,7 @@ def train_and_judge(output: Path) -> list[Row]:
     write_capture(ps.example_room(), capture)
     print(f"{time.perf_counter() - start:.0f} s")
 
-    common = ["--vis", "tensorboard", "--timestamp", DEMO.timestamp, "--experiment-name", "room"]
+    common = ["--vis", "tensorboard", "--timestamp", DEMO.name, "--experiment-name", "room"]
     run(
         f"Train a scene on these photos, {DEMO.scene_steps} steps.",
         ["ns-train", METHOD_NAMES.scene, "--output-dir", scenes, *common, "--max-num-iterations", DEMO.scene_steps]

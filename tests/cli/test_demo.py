@@ -47,12 +47,12 @@ def test_the_demo_runs_every_command_once_and_starts_anew(small_example, program
     output = tmp_path / "a demo"
     earlier = output / "scenes" / "room" / "splatfacto-cpu" / "demo"
     write_run(earlier, 5, 900)  # interrupted
-    (output / "capture" / "images").mkdir(parents=True)
-    (output / "notes.txt").write_text("of the user")
+    (output / "capture" / "demo" / "images").mkdir(parents=True)
+    (output / "capture" / "mine.jpg").write_text("of the user")
     main(["demo", "--output", str(output)])
     assert programs == ["pointsplat", "ns-train splatfacto-cpu", "ns-train pointsplat", "ns-eval", "ns-export"]
     assert [path.name for path in earlier.rglob("*.ckpt")] == ["step-000000011.ckpt"]
-    assert (output / "notes.txt").read_text() == "of the user"
+    assert (output / "capture" / "mine.jpg").read_text() == "of the user"
     assert len(read_ply(output / "example_compact.ply")) == 40
     assert (output / "example.png").stat().st_size > 10_000 and (output / "example.html").is_file()
     results = json.loads((output / "evaluation.json").read_text())["results"]["scenes"]["room"]
