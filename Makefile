@@ -2,7 +2,7 @@
 #   make test    run the test suite
 #   make lint    check style, types and the direction of imports
 #   make docs    build the documentation as a site, in site/
-#   make demo    a built-in scene made small, then the whole method: train, prune, refine, evaluate, export
+#   make demo    the scene that ships made small, then each command of the method once, in three minutes
 # Use an environment of your own with `make test VENV=/path/to/env`.
 
 VENV ?= .venv

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from lab.rooms import light
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.rooms import light
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -40,11 +40,8 @@ if TYPE_CHECKING:
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import make_refiner
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import report
     from pointsplat_ns.pages.scene_page import write_page
     from pointsplat_ns.rasterizer import rasterization, render
-    from pointsplat_ns.rooms import write_room
     from pointsplat_ns.tradeoff.measure import measure_tradeoff
     from pointsplat_ns.tradeoff.points import Tradeoff
     from pointsplat_ns.views import View, Views
@@ -69,10 +66,7 @@ _PUBLIC = {
     "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
     "pointsplat_ns.tradeoff.measure": ("measure_tradeoff",),
-    "pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner": ("make_refiner",),
-    "pointsplat_ns.nerfstudio_plugin.pointsplat.report": ("report",),
     "pointsplat_ns.rasterizer": ("rasterization", "render"),
-    "pointsplat_ns.rooms": ("write_room",),
     "pointsplat_ns.tradeoff.points": ("Tradeoff",),
     "pointsplat_ns.views": ("View", "Views"),
 }
@@ -104,7 +98,6 @@ __all__ = [
     "load_refiner",
     "lod",
     "lpips",
-    "make_refiner",
     "measure_tradeoff",
     "open_viewer",
     "place",
@@ -117,12 +110,10 @@ __all__ = [
     "refine",
     "render",
     "render_path",
-    "report",
     "sample_views",
     "save",
     "ssim",
     "write_page",
-    "write_room",
 ]
 
 

@@ -18,7 +18,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import pointsplat_ns as ps
-from evaluations import evaluation
 from making import REPOSITORY, imports_of
 from pointsplat_ns.cli import demo, main
 from pointsplat_ns.cli.scene_options import claims_until_the_end
@@ -69,15 +68,12 @@ RUNS = {
     "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.2": "5 frames",
     "export run -o exported.ply": "300 Gaussians",
     "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",
-    "report evaluation.json --html report.html": "report.html",
-    "rooms -o rooms --seeds 0 --frames 2 --width 32 --height 24": "room0",
 }
 """Commands that nothing is missing for, and what they print."""
 
 FAILS = {
-    "make-refiner -o made": "training needs nerfstudio, which is not installed; "
+    "train capture": "training a scene needs nerfstudio, which is not installed; "
     "pip install 'pointsplat-ns[nerfstudio]' adds it",
-    "train capture": "training a scene needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
     "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
 }
 """Commands that something is missing for, and what they say."""
@@ -113,7 +109,6 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
                 (packages / top).symlink_to(distribution.locate_file(top))
 
     ps.save(ps.prune(ps.example_room(), 600, by="coverage"), work / "room.ply")
-    (work / "evaluation.json").write_text(json.dumps(evaluation()))
     (work / "photos").mkdir()
     (work / "run" / "nerfstudio_models").mkdir(parents=True)
     (work / "run" / "config.yml").write_text(RUN_CONFIG)
@@ -184,7 +179,7 @@ def no_nerfstudio(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstudio, monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(demo, "compact_example", lambda *_: made.append("example"))
+    monkeypatch.setattr(demo, "compact_example", lambda *_: made.append("example") or [])
     missing = "the rest of the demo, which trains, needs nerfstudio, which is not"
     with pytest.raises(MissingPackageError, match=missing), claims_until_the_end():
         demo.demo(tmp_path)
@@ -192,12 +187,12 @@ def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstud
 
 
 def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys):
-    def fail(*_):
+    def fail(*_, **__):
         raise ModuleNotFoundError("No module named 'av'", name="av")
 
-    monkeypatch.setattr("pointsplat_ns.report", fail)
+    monkeypatch.setattr("pointsplat_ns.info", fail)
     with pytest.raises(SystemExit) as end:
-        main(["report", "evaluation.json"])
+        main(["info", "a.ply"])
     assert end.value.code == 1
     assert capsys.readouterr().err == "error: av is not installed; pip install pointsplat-ns adds what is missing\n"
 

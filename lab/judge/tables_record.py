@@ -34,7 +34,7 @@ FIGURE = "results_figure4.png"
 PAGE = """# The paper's networks and scores on two rooms
 
 `lab/judge/tables_record.py` writes this page from [results.json](results.json), which
-[`python -m lab.tables`](../tables.md) measured on two rooms of `pointsplat rooms`:
+[`python -m lab.tables`](../tables.md) measured on two rooms of `python -m lab.rooms`:
 
 ```bash
 python -m lab.tables outputs/room52 outputs/room53 -o results --views 5 --side 320 --scoring-views 12 \\

@@ -30,6 +30,7 @@ import pointsplat_ns as ps
 from lab.common import scenes
 from lab.common.printing import start
 from lab.common.timing import seconds_of
+from lab.rooms import write_room
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import gsplat_works
@@ -116,7 +117,7 @@ class Trainings:
         from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
         from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
-        photos = ps.write_room(self.folder / "photos" / "room0", seed=0, frames=12, width=160, height=120)
+        photos = write_room(self.folder / "photos" / "room0", seed=0, frames=12, width=160, height=120)
 
         def config() -> Any:
             made = splatfacto_cpu_config()

@@ -29,6 +29,7 @@ import tyro
 from lab.common.compare import lpips_or_none, metrics_of, photos_of
 from lab.common.printing import markdown, percent, start
 from lab.common.results import Results, Row, grouped
+from lab.common.running import folder_of_run
 from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
@@ -36,7 +37,6 @@ from pointsplat_ns.io import read_scene
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.nerfstudio_plugin.running import folder_of_run
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.programs import run_measured
 

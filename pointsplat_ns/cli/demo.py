@@ -1,93 +1,75 @@
-"""``pointsplat demo``: compacts the shipped scene, then trains scenes and a refiner on synthetic rooms."""
+"""``pointsplat demo``: makes the scene that ships small, then runs each command of the nerfstudio method once."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import shlex
 import shutil
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pointsplat_ns.cli.printing import written_size
-from pointsplat_ns.cli.scene_options import Share, claim_folder, claim_outputs
+from pointsplat_ns.cli.scene_options import claim_folder, claim_outputs
+
+if TYPE_CHECKING:
+    from pointsplat_ns.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Choices of the demo that have no option."""
+    """Choices of the demo, which has no options for them: as little as shows something."""
 
-    rooms: tuple[str, ...] = ("room0", "room1", "room2")
-    """Names of the synthetic rooms, each with its seed."""
-    held_out: str = "room2"
-    """The room without a part in the refiner's training."""
-    timestamp: str = "demo"
-    """Folder name of the runs, constant so that finished runs are found again."""
-    advice: str = "start over with --force, or name another --output"
-    """Advice if a training with another number of steps is finished."""
+    keep: str = "10%"
+    """Budget of the scene that ships."""
+    photos: int = 30
+    """Photos of the capture."""
+    size: tuple[int, int] = (192, 144)
+    """Width and height of a photo, pixels."""
+    walk: float = 1.3
+    """Radius of the circle that photos are taken from, metres; the room reaches 2.4 m from its middle."""
+    every: int = 5
+    """Each so many-th Gaussian of the scene is a point that the training starts from."""
+    scene_steps: int = 300
+    """Training steps of the scene."""
+    refiner_steps: int = 40
+    """Training steps of the refiner."""
+    name: str = "demo"
+    """Name of the folders that a second call replaces: those of the capture and the runs."""
 
 
 DEMO = DemoSettings()
 
 
-def demo(
-    output: Path = Path("outputs/demo"),
-    keep: Share = 0.1,
-    scene_steps: int = 900,
-    refiner_steps: int = 300,
-    frames: int = 60,
-    width: int = 256,
-    height: int = 192,
-    scene_only: bool = False,
-    force: bool = False,
-) -> None:
-    """Compact the scene that ships and draw it before and after, which takes a minute. Then continue with training,
-    which may be stopped: train small scenes, prune them, train the refiner, evaluate it on an unseen room, and export.
+def demo(output: Path = Path("outputs/demo"), scene_only: bool = False, force: bool = False) -> None:
+    """Make the scene that ships small, with a page and pictures. Then run each command of the nerfstudio method once:
+    train a scene on a few small photos, train a refiner on it, evaluate, export. It takes three minutes on two cores.
 
-    The commands that it runs are printed. After an interruption, a second call continues with what is not finished. It
-    never removes a training that has finished, except with --force.
+    The commands that it runs are printed. A second call starts anew.
 
     Args:
         output: folder for all results.
-        keep: share of the Gaussians to keep.
-        scene_steps: training steps of each room.
-        refiner_steps: training steps of the refiner.
-        frames: photos of each room.
-        width: of a photo, pixels.
-        height: of a photo, pixels.
         scene_only: write the scene that ships as room.ply, in this folder, and end.
-        force: start over: first remove rooms, trainings and pictures of an earlier demo in the folder.
+        force: with --scene-only, overwrite an existing room.ply.
     """
     from pointsplat_ns.errors import need
-    from pointsplat_ns.nerfstudio_plugin.running import has_finished
 
     if scene_only:
         write_example(Path("room.ply"), force)
         return
     claim_folder(output)
-    for folder in ("rooms", "scenes", "refiner", "pictures") if force else ():
-        if (output / folder).exists():
-            shutil.rmtree(output / folder)
-    scenes, refiner = training_folders(output)
-    for training, steps in [*((scene, scene_steps) for scene in scenes.values()), (refiner, refiner_steps)]:
-        has_finished(training, steps, DEMO.advice)  # refuses another number of steps before the work
-    compact_example(output, keep)
+    start = time.perf_counter()
+    rows = compact_example(output)
     need("nerfstudio", "the rest of the demo, which trains,")
-    print(
-        "\nThat is a usable result. The demo now goes on to train scenes and a refiner of its own, for about "
-        "15 minutes on two cores.\nIt may be stopped at any time with Ctrl-C; started again, it does "
-        "not repeat what it has finished.",
-        flush=True,
-    )
-    train_and_judge(output, keep, scene_steps, refiner_steps, (frames, width, height))
-
-
-def training_folders(output: Path) -> tuple[dict[str, Path], Path]:
-    """Folders of the trained scenes by room, and the folder of the trained refiner."""
-    from pointsplat_ns.io.runs import METHOD_NAMES
-    from pointsplat_ns.nerfstudio_plugin.running import folder_of_run
-
-    scenes = {name: folder_of_run(output / "scenes", name, METHOD_NAMES.scene, DEMO.timestamp) for name in DEMO.rooms}
-    return scenes, folder_of_run(output / "refiner", "rooms", METHOD_NAMES.refiner, DEMO.timestamp)
+    rows += train_and_judge(output)
+    show_results(rows)
+    print("So few steps show the commands. A refiner that gains takes hours: docs/guides/own_refiner.md.")
+    print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes; everything is in {output}")
 
 
 def write_example(path: Path, force: bool) -> None:
@@ -100,84 +82,175 @@ def write_example(path: Path, force: bool) -> None:
     print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
 
 
-def compact_example(output: Path, keep: float) -> None:
-    """Compact the shipped scene to a share of its Gaussians, and draw it before and after, in a folder."""
+def compact_example(output: Path) -> list[Row]:
+    """Compact the shipped scene in a folder, with a page and pictures. Gives the rows of the table."""
     import pointsplat_ns as ps
-    from pointsplat_ns.nerfstudio_plugin.running import run
 
-    start = time.perf_counter()
-    dense, small, picture = (output / f"example{end}" for end in (".ply", "_compact.ply", ".png"))
+    dense, small = output / "example.ply", output / "example_compact.ply"
+    page, pictures, result = output / "example.html", output / "example.png", output / "compact.json"
     ps.save(ps.example_room(), dense)
-    words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(picture)]
-    run(shlex.join([*words, "--force"]))
-    print(f"\n{picture}: the scene before and after, side by side")
-    print(f"{small}: the smaller scene; open it in any 3DGS viewer")
-    print(f"made in {time.perf_counter() - start:.0f} seconds")
-
-
-def train_and_judge(
-    output: Path, keep: float, scene_steps: int, refiner_steps: int, photos: tuple[int, int, int]
-) -> None:
-    """Train a scene of each of three rooms and a refiner on two of them; evaluate it on the third, and export the
-    third. ``photos`` are the number of photos of each room, their width and height in pixels."""
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.report import read_evaluation, show_report
-    from pointsplat_ns.nerfstudio_plugin.running import (
-        evaluate_command,
-        has_finished,
-        remove_interrupted,
-        run,
-        train_refiner_command,
-        train_scene_command,
+    run(
+        f"Make the room that ships small: {DEMO.keep} of its Gaussians, merged and repaired.",
+        ["pointsplat", "compact", dense, "--keep", DEMO.keep, "-o", small, "--picture", pictures, "--html", page]
+        + ["--json", "--force"],
+        result,
     )
-    from pointsplat_ns.rooms import write_room
+    print(f"{page}: the room before and after, to fly through in a browser")
+    print(f"{pictures}: the same as pictures, side by side")
+    print(f"{small}: the smaller room; open it in any 3DGS viewer")
+    made = json.loads(result.read_text("utf-8"))
+    reference = "renders of the dense room"
+    before = Row("room that ships", "dense", made["gaussians_before"], dense.stat().st_size, None, "")
+    return [before, Row("", "compact", made["gaussians"], made["bytes"], made["psnr"], reference)]
+
+
+def train_and_judge(output: Path) -> list[Row]:
+    """Train a scene on photos of the shipped one, and a refiner on that scene; evaluate and export. Gives the rows of
+    the table."""
+    import pointsplat_ns as ps
+    from pointsplat_ns.io.runs import METHOD_NAMES
+
+    capture, scenes, logs = output / "capture" / DEMO.name, output / "scenes", output / "logs"
+    trained = scenes / "room" / METHOD_NAMES.scene / DEMO.name
+    refined = output / "refiner" / "room" / METHOD_NAMES.refiner / DEMO.name
+    evaluation, exported = output / "evaluation.json", output / "exported"
+    for earlier in (capture, trained, refined):
+        shutil.rmtree(earlier, ignore_errors=True)
+    logs.mkdir(exist_ok=True)
 
     start = time.perf_counter()
-    rooms, scenes, refiners = output / "rooms", output / "scenes", output / "refiner"
-    scene_runs, trained = training_folders(output)
-    for name in DEMO.rooms:
-        if not (rooms / name).is_dir():
-            print(write_room(rooms / name, int(name[4:]), *photos))
-    for name, scene_run in scene_runs.items():
-        if not has_finished(scene_run, scene_steps, DEMO.advice):
-            remove_interrupted(scene_run)
-            run(train_scene_command(rooms / name, scenes, name, scene_steps, DEMO.timestamp, seed_points=20_000))
-    if not has_finished(trained, refiner_steps, DEMO.advice):
-        remove_interrupted(trained)
-        options = {"pipeline.model.keep": keep, "pipeline.model.size": "tiny"}
-        run(train_refiner_command(scenes, refiners, "rooms", refiner_steps, DEMO.timestamp, (DEMO.held_out,), options))
-    evaluation, pictures = output / "evaluation.json", output / "pictures"
-    run(evaluate_command(trained, evaluation, pictures))
-    refined, small = output / f"{DEMO.held_out}_refined.ply", output / f"{DEMO.held_out}_compact.ply"
-    run(shlex.join(["pointsplat", "export", str(trained), "-o", str(refined), "--force"]))
-    dense, views = scene_runs[DEMO.held_out], output / "compact.png"
-    words = ["pointsplat", "compact", str(dense), "--keep", f"{keep:g}", "-o", str(small), "--picture", str(views)]
-    run(shlex.join([*words, "--force"]))
+    print(f"\nDraw {DEMO.photos} photos of the room, with their poses and points, as ns-process-data leaves them.")
+    write_capture(ps.example_room(), capture)
+    print(f"{time.perf_counter() - start:.0f} s")
 
-    results = read_evaluation(evaluation)
-    picture = output / "before_after.png"
-    before_after(sorted(pictures.glob(f"{DEMO.held_out}_*.png")), results["scenes"][DEMO.held_out], picture)
-    show_report(results)
-    config = shlex.quote(str(trained / "config.yml"))
-    print(f"{refined}: open it in any 3DGS viewer, or run ns-viewer --load-config {config}")
-    print(f"{small}: the same room by pointsplat compact; {views} shows it")
-    print(f"{picture}: photo, dense, pruned and refined side by side, of a room that the refiner never saw")
-    print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes")
+    common = ["--vis", "tensorboard", "--timestamp", DEMO.name, "--experiment-name", "room"]
+    run(
+        f"Train a scene on these photos, {DEMO.scene_steps} steps.",
+        ["ns-train", METHOD_NAMES.scene, "--output-dir", scenes, *common, "--max-num-iterations", DEMO.scene_steps]
+        + ["--data", capture, "nerfstudio-data"],
+        logs / "train_scene.txt",
+    )
+    run(
+        f"Merge the scene to 30 % of its Gaussians, and train a refiner to undo the loss, {DEMO.refiner_steps} steps.",
+        ["ns-train", METHOD_NAMES.refiner, "--output-dir", refined.parents[2], *common]
+        + ["--max-num-iterations", DEMO.refiner_steps, "--data", scenes, "--pipeline.model.size", "tiny"]
+        + ["--pipeline.model.lpips-weight", 0],
+        logs / "train_refiner.txt",
+    )
+    run(
+        "Compare the dense, the pruned and the refined scene with photos that were held out.",
+        ["ns-eval", "--load-config", refined / "config.yml", "--output-path", evaluation]
+        + ["--render-output-path", output / "pictures"],
+        logs / "evaluate.txt",
+    )
+    run(
+        "Export the refined scene.",
+        ["ns-export", "gaussian-splat", "--load-config", refined / "config.yml", "--output-dir", exported],
+        logs / "export.txt",
+    )
+    print(f"{output / 'pictures'}: photo, dense, pruned and refined side by side")
+    print(f"{exported}: the refined scene")
+    scene = json.loads(evaluation.read_text("utf-8"))["results"]["scenes"]["room"]
+    return [
+        Row("trained scene" * (variant == "dense"), variant, values["gaussians"], 1e6 * values["megabytes"],
+            values["psnr"], "held-out photos")
+        for variant in ("dense", "pruned", "refined")
+        for values in [scene[variant]]
+    ]  # fmt: skip
 
 
-def before_after(views: list[Path], scene: dict, path: Path, rows: int = 3) -> None:
-    """Draw some views, spread over all, with captions from the evaluation of a scene: photo, dense, pruned and refined
-    side by side, as in the images that ``ns-eval`` wrote."""
-    from matplotlib.image import imread
-    from numpy import array_split
-    from numpy.typing import ArrayLike
+def write_capture(scene: Gaussians, folder: Path) -> None:
+    """Write renders of the shipped scene, on a walk around its middle, as a capture: photos, transforms.json, and
+    points to start from, which are the places and colours of some Gaussians."""
+    import numpy as np
+    import torch
 
-    from pointsplat_ns.compression.pictures import side_by_side
+    import pointsplat_ns as ps
+    from pointsplat_ns.geometry.harmonics import SH_C0
+    from pointsplat_ns.io.pictures import write_picture
+    from pointsplat_ns.looking.poses import look_at, views_of
+    from pointsplat_ns.system.progress import tracked
 
-    titles = ["photo, held out"]
-    for variant in ("dense", "pruned", "refined"):
-        values = scene[variant]
-        size = f"{values['gaussians']:,} Gaussians, {values['megabytes']:.1f} MB"
-        titles.append(f"{variant}: {size}, {values['psnr']:.1f} dB")
-    chosen = views[:: max(1, len(views) // rows)][:rows]
-    images: list[list[ArrayLike]] = [[*array_split(imread(view), len(titles), axis=1)] for view in chosen]
-    side_by_side(images, titles, path)
+    (folder / "images").mkdir(parents=True)
+    turn = torch.arange(DEMO.photos) * 2 * math.pi / DEMO.photos
+    yaw = turn + torch.tensor([0.6, 0.0, -0.6]).repeat(DEMO.photos // 3)  # rad: across the middle, and to both sides
+    eyes = torch.stack([DEMO.walk * turn.cos(), DEMO.walk * turn.sin(), 1.5 + 0.2 * (3 * turn).sin()], dim=1)
+    ahead = torch.stack([-yaw.cos(), -yaw.sin(), torch.full_like(yaw, -0.2)], dim=1)
+    views = views_of(look_at(eyes, eyes + ahead), *DEMO.size, diagonal=5.0)
+    frames = []
+    for number, view in enumerate(tracked(views, "drawing photos", len(views))):
+        name = f"images/{number:02d}.png"
+        write_picture(ps.render(scene, view), folder / name)
+        pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # OpenGL's axes
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    (width, height), K = DEMO.size, views.Ks[0].tolist()
+    camera = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": width, "h": height}
+
+    some = scene[:: DEMO.every]
+    colors = (255 * (0.5 + SH_C0 * some.features_dc).clamp(0, 1)).round()
+    kinds = [f"property float {axis}" for axis in "xyz"]
+    kinds += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = "\n".join(["ply", "format ascii 1.0", f"element vertex {len(some)}", *kinds, "end_header"])
+    points = torch.cat([some.means, colors], dim=1).numpy()
+    np.savetxt(folder / "points.ply", points, fmt=["%.5g"] * 3 + ["%d"] * 3, header=header, comments="")
+    content = {"camera_model": "OPENCV", **camera, "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def run(about: str, words: list[Any], log: Path) -> None:
+    """Say what a command does, print it, run it, and print the seconds that it took. Its standard output goes to a
+    file. If this is interrupted, the command is ended.
+
+    Raises:
+        PointSplatError: if the command fails.
+    """
+    from pointsplat_ns.errors import PointSplatError
+    from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE
+    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import JIT_SCRIPT
+
+    start = time.perf_counter()
+    program, *arguments = map(str, words)
+    command = shlex.join([program, *arguments])
+    print(f"\n{about}\n$ {command}", flush=True)
+    beside = Path(sys.executable).parent / program
+    environment = {
+        # Threads that wait for one another spin briefly and then sleep: much faster where other programs run as well.
+        "GOMP_SPINCOUNT": "20000",
+        "PYTHONWARNINGS": JIT_SCRIPT.option,
+        # Nothing is there: LPIPS is left out, whose weights are a download of 233 MB.
+        WEIGHTS_VARIABLE: str(log.with_name("no_lpips_weights")),
+        **os.environ,
+    }
+    with log.open("wb") as stream:
+        done = subprocess.run([str(beside) if beside.exists() else program, *arguments], env=environment, stdout=stream)
+    if done.returncode != 0:
+        where = f"what it said is above and in {log}"
+        raise PointSplatError(f"{command}: ended with exit status {done.returncode}; {where}")
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+class Row(NamedTuple):
+    """A line of the table."""
+
+    scene: str
+    variant: str
+    gaussians: int
+    bytes: float
+    """Of a PLY of float32."""
+    psnr: float | None
+    """dB."""
+    reference: str
+    """What the PSNR is against."""
+
+
+def show_results(rows: list[Row]) -> None:
+    """Print the table of all scenes that the demo made."""
+    from pointsplat_ns.system.terminal import print_table
+
+    lines = [
+        (row.scene, row.variant, f"{row.gaussians:,}", f"{row.bytes / 1e6:.2f}",
+         "" if row.psnr is None else f"{row.psnr:.1f}", row.reference)
+        for row in rows
+    ]  # fmt: skip
+    print()
+    print_table(("scene", "variant", "Gaussians", "MB", "PSNR dB", "against"), lines, left=(0, 1, 5))

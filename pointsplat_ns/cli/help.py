@@ -48,25 +48,13 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),
         ("one scene of a trained refiner", "pointsplat export outputs/refiner --scene room2 -o room2.ply"),
     ),
-    "report": (
-        ("the table", "pointsplat report evaluation.json"),
-        ("and a page with charts", "pointsplat report evaluation.json --html evaluation.html"),
-    ),
-    "rooms": (("two rooms of 40 photos", "pointsplat rooms -o rooms --seeds 0 1 --frames 40"),),
     "train": (
         ("50,000 Gaussians from photos with poses", "pointsplat train my_capture --keep 50000"),
         ("sooner: fewer pixels, fewer steps", "pointsplat train my_capture --keep 50k --scale 0.5 --steps 3000"),
     ),
-    "make-refiner": (
-        ("a refiner for rooms", "pointsplat make-refiner"),
-        ("a small one of four rooms", "pointsplat make-refiner -o outputs/mine --rooms 4 --steps 300"),
-    ),
-    "make-feedback": (
-        ("of two scenes", "pointsplat make-feedback kitchen.ply room.ply -o feedback.safetensors --updates 200"),
-    ),
     "demo": (
         ("a scene to try commands with: room.ply", "pointsplat demo --scene-only"),
-        ("in a folder of its own", "pointsplat demo --output outputs/try --keep 0.2"),
+        ("in a folder of its own", "pointsplat demo --output outputs/try"),
     ),
 }
 """Command lines of every command, with the purpose of each."""

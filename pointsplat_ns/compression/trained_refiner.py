@@ -77,8 +77,8 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     device = default_device() if device is None else device
     if path is None and not SHIPPED_REFINER.is_file():
         raise WeightsError(
-            f"{SHIPPED_REFINER}: the refiner that ships is not there; name another (--refiner RUN_OR_FILE), or make it "
-            "with pointsplat make-refiner"
+            f"{SHIPPED_REFINER}: the refiner that ships is not there; install the package again, or name another "
+            "(--refiner RUN_OR_FILE)"
         )
     path = SHIPPED_REFINER if path is None else Path(path)
     kind = path.suffix.lower()

@@ -96,13 +96,6 @@ class Run:
         return self.method_name.startswith("splatfacto") or self.model_fields.keys() >= needed
 
     @property
-    def steps_if_finished(self) -> int | None:
-        """Steps of a training that has finished; None if it was interrupted. If it is not known how many steps it was
-        to take, it counts as finished."""
-        done = self.step + 1
-        return None if self.planned_steps is not None and done < self.planned_steps else done
-
-    @property
     def rasterize_mode(self) -> Literal["classic", "antialiased"]:
         """Rasterize mode that the run was trained with."""
         return "antialiased" if self.model_fields.get("rasterize_mode") == "antialiased" else "classic"

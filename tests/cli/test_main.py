@@ -21,12 +21,12 @@ ALLOCATION = 1 << 60
 """Bytes that no machine has."""
 
 
-def deep(*_) -> int:
+def deep(*_, **__) -> int:
     return 1 + deep()
 
 
 def raising(error: BaseException):
-    def fail(*_):
+    def fail(*_, **__):
         raise error
 
     return fail
@@ -39,24 +39,24 @@ def raising(error: BaseException):
         (raising(OSError(28, "No space left on device")), "No space left on device"),
         (raising(OSError("odd\nsecond line")), "odd"),
         (raising(MemoryError()), "not enough memory (MemoryError)"),
-        (lambda *_: torch.empty(ALLOCATION, dtype=torch.uint8), "not enough memory ("),
-        (lambda *_: bytearray(ALLOCATION), "not enough memory (MemoryError)"),
+        (lambda *_, **__: torch.empty(ALLOCATION, dtype=torch.uint8), "not enough memory ("),
+        (lambda *_, **__: bytearray(ALLOCATION), "not enough memory (MemoryError)"),
         (deep, "the input is nested too deeply (maximum recursion depth exceeded"),
     ],
 )
 def test_an_error_of_the_system_is_one_line_and_status_1(fail, said, monkeypatch, capsys):
-    monkeypatch.setattr("pointsplat_ns.report", fail)
+    monkeypatch.setattr("pointsplat_ns.info", fail)
     with pytest.raises(SystemExit) as end:
-        main(["report", "evaluation.json"])
+        main(["info", "a.ply"])
     assert end.value.code == 1
     errors = capsys.readouterr().err
     assert errors.startswith(f"error: {said}") and errors.count("\n") == 1
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch):
-    monkeypatch.setattr("pointsplat_ns.report", raising(RuntimeError("a bug")))
+    monkeypatch.setattr("pointsplat_ns.info", raising(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
-        main(["report", "evaluation.json"])
+        main(["info", "a.ply"])
 
 
 def test_the_version_is_printed(capsys):
@@ -171,9 +171,8 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
     ("words", "name", "value"),
     [
         ("view a.ply --port 8k", "port", 8000),
-        ("make-refiner --steps 1,000", "steps", 1000),
+        ("train capture --steps 1,000", "steps", 1000),
         ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
-        ("demo --keep 20%", "keep", 0.2),
     ],
 )
 def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):

@@ -25,18 +25,14 @@ FILES = (
     "convert gone.ply OUT.sog",
     "export gone -o OUT.splat",
     "info gone.ply --views OUT.png",
-    "report gone.json --html OUT.html",
     "render gone.ply -o OUT.mp4",
-    "make-feedback gone.ply -o OUT.safetensors",
 )
 
 FOLDERS = (
     "lod gone.ply -o OUT",
     "tradeoff gone.ply -o OUT",
     "render gone.ply -o OUT",
-    "make-refiner -o OUT --rooms 0",
-    "make-refiner -o a --weights OUT --rooms 0",
-    "demo --output OUT --keep 7",
+    "demo --output OUT",
 )
 """Commands that fail at their work, because there is no such scene, unless they find before that they cannot write."""
 

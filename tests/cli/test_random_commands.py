@@ -29,12 +29,11 @@ SECONDS = 300
 FAST = {
     "compact": "--effort instant",
     "tradeoff": "--keep 10% --views 1 --repairs none",
-    "tables": "--fine-tune 1 --views 1 --side 16 --keeps 0.5",
     "render": "--width 16 --height 12 --seconds 0.1",
 }
 """Options that come first, so that a command which can work does not work long."""
 
-LONG = {"train", "demo", "make-refiner", "make-feedback", "rooms"}
+LONG = {"train", "demo"}
 """Commands that cannot be made short."""
 
 OTHERS = [

@@ -57,9 +57,9 @@ def test_too_little_address_space_for_torch_is_one_line(gigabytes):
     [
         ["prune", ""], ["prune", "a.ply", "-o", ""], ["info", "a.ply", ""], ["convert", "a.ply", ""], ["view", ""],
         ["compact", "", "--keep", "10%"], ["render", "a.ply", "-o", ""], ["export", "", "-o", "a.ply"], ["lod", ""],
-        ["tradeoff", ""], ["train", ""], ["report", ""], ["rooms", "-o", ""],
+        ["tradeoff", ""], ["train", ""],
         ["demo", "--output", ""],
-        ["make-refiner", "-o", ""], ["make-feedback", ""], ["prune", "a.ply", "--poses", ""],
+        ["prune", "a.ply", "--poses", ""],
     ],
 )  # fmt: skip
 def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):

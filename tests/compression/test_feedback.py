@@ -1,25 +1,15 @@
 """Feedback, and training with it."""
 
 import math
-import random
-from dataclasses import replace
 
 import pytest
 import torch
 
-from pointsplat_ns.compression import feedback_training
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.feedback_training import (
-    FeedbackTrainingSettings,
-    TrainingScene,
-    roll_out,
-    train_feedback,
-)
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refiner
+from pointsplat_ns.refiner.feedback import FeedbackRefiner
 
 
 @pytest.fixture(scope="module")
@@ -172,33 +162,3 @@ def test_features_and_steps_are_right_at_the_extremes(scene, size, degree):
         torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-3, atol=1e-3)
         for name in PARAMETERS:
             torch.testing.assert_close(found[0][1][name].double(), found[1][1][name], rtol=1e-4, atol=1e-6)
-
-
-@pytest.fixture
-def small(hollow_ball, monkeypatch) -> TrainingScene:
-    monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,)))
-    monkeypatch.setattr(feedback_training, "RESOLUTION", (48, 27))
-    return TrainingScene.of("ball", hollow_ball, ["10%", "20%"], view_batches=1)
-
-
-def test_training_brings_repairs_closer(small, tmp_path):
-    """The same repairs before and after."""
-
-    def reached(network: FeedbackRefiner) -> float:
-        with torch.no_grad():
-            repairs = [roll_out(network, small, "20%", 6, random.Random(seed)) for seed in range(4)]
-        return float(torch.stack(repairs).mean())
-
-    shares: list[float] = []
-    network = train_feedback([small], 25, at_once=1, output=tmp_path / "a.safetensors", progress=shares.append)
-    assert shares[-1] == 1 and len(shares) == 25
-    assert reached(network) > reached(FeedbackRefiner()) + 0.05
-    saved = read_feedback_refiner(tmp_path / "a.safetensors")
-    assert reached(saved) == pytest.approx(reached(network), abs=1e-4)
-
-
-def test_scenes_that_cannot_be_trained_on_are_refused(small):
-    with pytest.raises(DataError, match="no scene"):
-        train_feedback([], 1)
-    with pytest.raises(DataError, match="ball: 8 views; expected at least 9"):
-        train_feedback([replace(small, views=(small.views[0][:8], small.views[1][:8]))], 1)

@@ -106,7 +106,7 @@ def test_anything_else_is_no_refiner(tmp_path):
 def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(trained_refiner, "SHIPPED_REFINER", tmp_path / "refiner.safetensors")
     with pytest.raises(
-        WeightsError, match="not there; .*--refiner RUN_OR_FILE.*, or .*pointsplat make-refiner"
+        WeightsError, match="not there; install the package again, or .*--refiner RUN_OR_FILE"
     ) as caught:
         load_refiner()
     assert "\n" not in str(caught.value)

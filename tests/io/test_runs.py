@@ -31,7 +31,7 @@ def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
     run = open_run(folder)
     assert run.folder == folder and run.config_path == folder / "config.yml"
     assert run.checkpoint == folder / "nerfstudio_models" / "step-000029999.ckpt" and run.step == 29999
-    assert run.planned_steps == 1_000_000 and run.steps_if_finished is None
+    assert run.planned_steps == 1_000_000
     assert (run.method_name, run.experiment_name, run.timestamp) == ("splatfacto", "kitchen", "2024-05-06_070809")
     assert run.data == tmp_path / "data" / "kitchen"
     assert run.dataparser_class == "nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig"

@@ -3,8 +3,8 @@
     python bare_machine.py COMMANDS.json RESULTS.json
 
 The first file is a list of command lines, each a list of words; "modules" is an attempt to import all modules. The
-second is a list of what each printed, its exit status and the hosts that it tried to reach. Views and rooms are as
-small as in the other tests.
+second is a list of what each printed, its exit status and the hosts that it tried to reach. Views are as small
+as in the other tests.
 """
 
 import importlib
@@ -59,9 +59,7 @@ def outcome(words: list[str]) -> dict:
 if __name__ == "__main__":
     sys.addaudithook(no_network)
     from pointsplat_ns.looking import view_source
-    from pointsplat_ns.rooms import light
 
     view_source.RESOLUTION = (64, 48)
-    light.LIGHT = light.LightSettings(0.1, 0.5)
     commands, results = map(Path, sys.argv[1:])
     results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))

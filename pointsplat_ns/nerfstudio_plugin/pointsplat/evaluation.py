@@ -21,11 +21,18 @@ from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
 
 METRICS = ("psnr", "ssim", "lpips")
+
+VARIANTS = ("dense", "pruned", "refined")
+
+COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "Gaussians", 0),
+           ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
+"""Columns of the printed table: a value of each variant, the title, digits to show."""
 
 
 @dataclass
@@ -151,6 +158,38 @@ def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], w
         summary["scenes"] = {r.name: rows[r.name] for r in reports}
         summary["against_dense_renders"] = other
     return summary
+
+
+def print_summary(summary: dict[str, Any]) -> None:
+    """Print the results of ``ns-eval``: a table of the scenes compared with photos, one of those compared with renders
+    of the dense scene, and the reason if LPIPS is missing."""
+    settings = summary["settings"]
+    made = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
+    for part in filter(None, (summary, summary.get("against_dense_renders"))):
+        blocks = [
+            (name, "yes" if scene["seen_in_training"] else "never", scene)
+            for name, scene in summary["scenes"].items()
+            if scene["reference"] == part["reference"]
+        ]
+        if len(blocks) > 1:
+            means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
+            blocks += [("average", seen, part[key]) for seen, key in means if key in part]
+        rows = [
+            (*((name, seen) if variant == VARIANTS[0] else ("", "")), variant, *_cells(scene[variant]))
+            for name, seen, scene in blocks
+            for variant in VARIANTS
+        ]
+        header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
+        reference = {"photos": "held-out photos", "dense renders": "the dense scenes' own renders"}[part["reference"]]
+        title = f"{made}; compared with {reference}"
+        print_table(header, rows, title=title, left=(0, 1, 2), section=len(VARIANTS))
+    if "lpips_note" in summary:
+        print(f"no LPIPS: {summary['lpips_note']}")
+
+
+def _cells(values: dict[str, Any]) -> list[str]:
+    """The columns of a variant; a dash for what was not computed."""
+    return ["-" if values[name] is None else f"{values[name]:,.{digits}f}" for name, _, digits in COLUMNS]
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:

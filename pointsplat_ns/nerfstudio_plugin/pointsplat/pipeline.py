@@ -24,6 +24,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     SceneReport,
     evaluate_scene,
     only_finite,
+    print_summary,
     summarize_by_reference,
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
@@ -238,7 +239,11 @@ class PointSplatPipeline(VanillaPipeline):
         summary["supervision"] = manager.supervision
         if lpips.reason is not None:
             summary["lpips_note"] = lpips.reason
-        return summary if step is None else only_finite(summary)
+        if step is not None:
+            return only_finite(summary)
+        if processes.rank() == 0:
+            print_summary(summary)
+        return summary
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Saves the network alone at the end of training, for use without the training scenes."""

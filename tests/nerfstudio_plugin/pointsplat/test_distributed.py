@@ -17,8 +17,8 @@ from torch import nn
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from broken_steps import broken
+from lab import feedback_training
 from making import REPOSITORY, ball, box_room, dense_config, quick_start, views_sampled_once
-from pointsplat_ns.compression import feedback_training
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.metrics.lpips import LpipsUnavailable

@@ -15,15 +15,10 @@ import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import SHARED_DATA, parsed_by_ns_train, pipeline_of, run_of, same, small_config
+from making import SHARED_DATA, pipeline_of, run_of, same, small_config
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
-from pointsplat_ns.nerfstudio_plugin.pointsplat.make_refiner import (
-    RECIPE,
-    refiner_command,
-    scene_settings,
-)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig
 from pointsplat_ns.pruning import METHODS, score_of, select
 from pointsplat_ns.rasterizer import rasterization
@@ -134,29 +129,6 @@ def test_settings_that_contradict_each_other_are_refused_and_leave_no_folder(tra
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()
     assert not (tmp_path / "outputs").exists()
-
-
-def test_the_scene_command_says_what_the_settings_say():
-    settings = scene_settings(RECIPE.train_seeds[0])
-    config = parsed_by_ns_train(settings.train_command(Path("rooms/a b"), Path("scenes"), "recipe"))
-    model = config.pipeline.model
-    assert config.method_name == "splatfacto-cpu" and config.experiment_name == settings.name
-    assert config.max_num_iterations == settings.steps
-    assert model.densify_grad_thresh == pytest.approx(settings.densify_grad_thresh, rel=0.05)  # two digits
-    assert model.cull_alpha_thresh == settings.cull_alpha_thresh
-    assert model.rasterize_mode == ("antialiased" if settings.antialiased else "classic")
-    assert model.use_scale_regularization == settings.scale_regularization
-    assert config.pipeline.datamanager.dataparser.num_seed_points == settings.seed_points
-    assert config.data == Path("rooms/a b")
-
-
-def test_the_refiner_command_holds_the_unseen_rooms_out():
-    config = parsed_by_ns_train(refiner_command(Path("o/scenes"), Path("o/refiners"), "name", "recipe", "tiny", 70, 3))
-    manager, model = config.pipeline.datamanager, config.pipeline.model
-    assert config.method_name == "pointsplat" and config.max_num_iterations == 70
-    assert manager.eval_scenes == tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
-    assert (manager.supervision, manager.seed) == ("dense", 3)
-    assert model.keep == RECIPE.keep and model.size == "tiny" and model.by == "merge"
 
 
 LPIPS_WEIGHTS = SHARED_DATA / "weights"

@@ -1,16 +1,27 @@
-"""``pointsplat make-feedback``: trains the network that sets the steps of repairs."""
+"""Trains the network that sets the steps of repairs.
+
+python -m lab.make_feedback kitchen.ply room.ply -o feedback.safetensors --updates 200
+"""
 
 from __future__ import annotations
 
+import functools
+import math
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.scene_options import claim_file
+import pointsplat_ns as ps
+from lab.common.printing import start as start_program
+from lab.feedback_training import TrainingScene, train_feedback
+from pointsplat_ns.refiner.feedback import read_feedback_refiner
+from pointsplat_ns.system.processes import connect_torchrun, torchrun_device, torchrun_rank
+from pointsplat_ns.system.progress import progress_bar, tracked
+from pointsplat_ns.system.threads import fixed_threads
 
 
-def make_feedback(
+def main(
     scenes: Annotated[list[Path], tyro.conf.Positional],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/feedback.safetensors"),
     keep: tuple[str, ...] = ("3%", "10%", "30%", "50%"),
@@ -24,8 +35,8 @@ def make_feedback(
     """Train the network that sets the steps of `compact`'s repairs, on scenes and what is merged of them; no photos.
 
     It is saved every minute and at the end. With a GPU, 1,000 updates take some minutes to an hour; without one, days.
-    Under `torchrun --nproc-per-node 4 --no-python pointsplat make-feedback ...` four processes share the work; on one
-    GPU that pays too.
+    Under `torchrun --nproc-per-node 4 -m lab.make_feedback ...` four processes share the work; on one GPU that pays
+    too.
 
     Args:
         scenes: 3DGS .ply files, Splatfacto checkpoints or runs.
@@ -39,16 +50,6 @@ def make_feedback(
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.
     """
-    import functools
-    import math
-
-    import pointsplat_ns as ps
-    from pointsplat_ns.compression.feedback_training import TrainingScene, train_feedback
-    from pointsplat_ns.refiner.feedback import read_feedback_refiner
-    from pointsplat_ns.system.processes import connect_torchrun, torchrun_device, torchrun_rank
-    from pointsplat_ns.system.progress import progress_bar, tracked
-    from pointsplat_ns.system.threads import fixed_threads
-
     if seconds is not None and not seconds > 0:
         raise ps.DataError(f"--seconds {seconds:g}: expected a number above 0")
     if updates < 1:
@@ -56,8 +57,6 @@ def make_feedback(
     known = None if start is None else read_feedback_refiner(start)
     connect_torchrun()
     device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
-    if first:
-        claim_file(output, force=True)
     with fixed_threads(threads):
         for path in tracked(scenes, "merging scenes", len(scenes), first):
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))
@@ -68,3 +67,7 @@ def make_feedback(
             train_feedback(ready, updates, at_once, seed, output, report, seconds or math.inf, known)
     if first:
         print(f"{output}: the network")
+
+
+if __name__ == "__main__":
+    start_program(main)

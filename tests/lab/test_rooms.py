@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-from pointsplat_ns.cli import main
+from lab.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
+from lab.rooms.__main__ import main as draw_rooms
+from lab.rooms.raycast import Solids, chart_points, occluded, surface, trace
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
-from pointsplat_ns.rooms import capture_path, default_intrinsics, light, make_room, render_room, write_room
-from pointsplat_ns.rooms.raycast import Solids, chart_points, occluded, surface, trace
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
 
@@ -46,7 +46,7 @@ def poses(room):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, coarser_light):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pointsplat_ns.rooms.write.make_room", room_of)
+        patch.setattr("lab.rooms.write.make_room", room_of)
         return write_room(
             tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False
         )
@@ -262,12 +262,10 @@ def test_surface_coordinates_and_normals_invert_chart_points():
 
 
 def test_rooms_that_are_there_are_left_alone_by_the_same_command(tmp_path, coarse_rooms, capsys):
-    words = ["rooms", "-o", str(tmp_path), "--seeds", "0", "--frames", "2", "--width", "32", "--height", "24"]
-    main(words)
+    draw_rooms(tmp_path, seeds=(0,), frames=2, width=32, height=24)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    main(words)
+    draw_rooms(tmp_path, seeds=(0,), frames=2, width=32, height=24)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
     assert "room0: there already" in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main([*words[:-1], "16"])  # others of that name are not overwritten
-    assert "is not an empty folder" in capsys.readouterr().err
+    with pytest.raises(DataError, match="is not an empty folder"):  # others of that name are not overwritten
+        draw_rooms(tmp_path, seeds=(0,), frames=2, width=32, height=16)

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lab.rooms.render import default_intrinsics, render_room
+from lab.rooms.room import Room, make_room
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import lack_of_room, read_text
-from pointsplat_ns.rooms.render import default_intrinsics, render_room
-from pointsplat_ns.rooms.room import Room, make_room
 from pointsplat_ns.system.progress import Progress, tracked
 
 
@@ -114,7 +114,7 @@ def capture_path(room: Room, frames: int, seed: int) -> Tensor:
     camera is deep, and above all that stands in the middle.
 
     Example:
-        >>> from pointsplat_ns.rooms import make_room
+        >>> from lab.rooms import make_room
         >>> tuple(capture_path(make_room(seed=3), frames=5, seed=3).shape)
         (5, 4, 4)
     """

@@ -5,21 +5,20 @@ It did not make the refiner that ships, whose card in ``pointsplat_ns/refiner/pr
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 
-from pointsplat_ns.errors import DataError, need
-from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.report import VARIANTS, read_evaluation
-from pointsplat_ns.nerfstudio_plugin.running import (
+from lab.common.printing import start
+from lab.common.running import (
     StoppedError,
     evaluate_command,
     folder_of_run,
@@ -29,8 +28,11 @@ from pointsplat_ns.nerfstudio_plugin.running import (
     train_refiner_command,
     train_scene_command,
 )
+from lab.rooms import write_room
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES
 from pointsplat_ns.refiner import read_metadata, read_refiner, save_refiner
-from pointsplat_ns.rooms import write_room
 
 
 @dataclass(frozen=True)
@@ -50,28 +52,15 @@ class RecipeSettings:
 RECIPE = RecipeSettings()
 
 
-@dataclass(frozen=True)
-class MadeRefiner:
-    """The results of :func:`make_refiner`."""
-
-    weights: Path
-    card: Path
-    """Model card: training data, command, results."""
-    pictures: Path
-    """Folder of images: photo, dense, pruned and refined side by side."""
-    results: dict[str, Any]
-    """Results of the evaluation."""
-
-
-def make_refiner(
-    output: str | Path,
-    weights: str | Path | None = None,
+def main(
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/make-refiner"),
+    weights: Path | None = None,
     size: Literal["tiny", "small", "full"] = "tiny",
     steps: int = 700,
     rooms: int | None = None,
     workers: int | None = None,
     seed: int = 0,
-) -> MadeRefiner:
+) -> None:
     """Generate rooms, train a scene of each, train a refiner on them, and evaluate it on rooms it was not trained on.
 
     The commands that it runs are printed. After an interruption, a second call continues with what is not finished.
@@ -84,26 +73,11 @@ def make_refiner(
         rooms: number of rooms to train on; by default all.
         workers: number of scenes trained at the same time, on one thread each; by default one per core.
         seed: seed of the network's initial weights and of the order of scenes and views.
-
-    Raises:
-        DataError: if ``rooms`` or ``steps`` is out of range.
-        MissingPackageError: if nerfstudio is not installed.
-        SceneError: if a training of another number of steps has finished in the folder.
-        PointSplatError: if a command fails.
-
-    Example:
-        >>> import pointsplat_ns as ps
-        >>> ps.make_refiner("outputs/mine", steps=0)
-        Traceback (most recent call last):
-        ...
-        pointsplat_ns.errors.DataError: --steps 0: expected at least 1
     """
-    output = Path(output)
     if rooms is not None and not 1 <= rooms <= len(RECIPE.train_seeds):
         raise DataError(f"--rooms {rooms}: expected 1 to {len(RECIPE.train_seeds)}")
     if steps < 1:
         raise DataError(f"--steps {steps}: expected at least 1")
-    need("nerfstudio", "training")
     train_seeds = RECIPE.train_seeds[:rooms]
     _make_scenes(output, (*train_seeds, *RECIPE.unseen_seeds), workers or os.cpu_count() or 1)
 
@@ -112,29 +86,29 @@ def make_refiner(
     evaluation, pictures = output / f"{name}.json", output / "pictures" / name
     if not has_finished(trained, steps):
         remove_interrupted(trained)
-        evaluation.unlink(missing_ok=True)
         run(refiner_command(output / "scenes", output / "refiners", name, RECIPE.timestamp, size, steps, seed))
-    if not evaluation.is_file():
-        run(evaluate_command(trained, evaluation, pictures))
-    results = read_evaluation(evaluation)
+    run(evaluate_command(trained, evaluation, pictures))
+    results = json.loads(evaluation.read_text("utf-8"))["results"]
 
     options = "" if rooms is None else f" --rooms {rooms}"
     about = {
-        "command": f"pointsplat make-refiner --size {size} --steps {steps} --seed {seed}{options}",
+        "command": f"python -m lab.make_refiner --size {size} --steps {steps} --seed {seed}{options}",
         "by": "merge",
         "keep": RECIPE.keep,
         "steps": steps,
         "scenes": [f"room{seed}" for seed in train_seeds],
-        "unseen": {variant: results["average_unseen"][variant] for variant in VARIANTS},
+        "unseen": results["average_unseen"],
     }
-    target = Path(weights or output)
+    target = weights or output
     refiner = read_refiner(trained / RUN_FILES.refiner)
     save_refiner(refiner, target / RUN_FILES.refiner, {**read_metadata(trained / RUN_FILES.refiner), **about})
     command = refiner_command(Path("scenes"), Path("refiners"), name, RECIPE.timestamp, size, steps, seed)
     with replacing(target / "CARD.md") as part:
         parameters = sum(p.numel() for p in refiner.parameters())
         part.write_text(card_text(about, results, command, parameters), encoding="utf-8")
-    return MadeRefiner(target / RUN_FILES.refiner, target / "CARD.md", pictures, results)
+    print(f"{target / RUN_FILES.refiner}: the refiner")
+    print(f"{target / 'CARD.md'}: its training and results")
+    print(f"{pictures}: photo, dense, pruned and refined side by side")
 
 
 def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
@@ -250,9 +224,9 @@ def card_text(about: dict[str, Any], results: dict[str, Any], command: str, para
 A network of {parameters:,} parameters ({results["settings"]["size"]}, dual-branch encoder) that repairs 3D Gaussian
 Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Gaussians. One forward pass, no photos.
 
-- **Data:** {len(about["scenes"])} furnished rooms that the package makes itself ({about["scenes"][0]} to
+- **Data:** {len(about["scenes"])} furnished rooms that `python -m lab.rooms` draws ({about["scenes"][0]} to
   {about["scenes"][-1]}: size, furniture, textures, lights, path and size of the pictures all differ), each trained with
-  `splatfacto-cpu` at settings of its own (`pointsplat_ns/nerfstudio_plugin/pointsplat/make_refiner.py`). No
+  `splatfacto-cpu` at settings of its own (`lab/make_refiner.py`). No
   downloaded data.
 - **Made by:** `{about["command"]}`
 - **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
@@ -279,3 +253,7 @@ def _row(scene: str, variant: str, values: dict[str, Any]) -> str:
     return (
         f"| {scene} | {variant} | {values['psnr']:.2f} | {values['ssim']:.3f} | {lpips} | {values['gaussians']:,.0f} |"
     )
+
+
+if __name__ == "__main__":
+    start(main)

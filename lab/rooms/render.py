@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rooms.building import Light
-from pointsplat_ns.rooms.raycast import dot, surface, trace, unit
-from pointsplat_ns.rooms.room import Room
+from lab.rooms.building import Light
+from lab.rooms.raycast import dot, surface, trace, unit
+from lab.rooms.room import Room
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
@@ -39,7 +39,7 @@ def render_room(
         metres, of the ray through each pixel's centre.
 
     Example:
-        >>> from pointsplat_ns.rooms import capture_path, make_room
+        >>> from lab.rooms import capture_path, make_room
         >>> room = make_room(seed=3)
         >>> pose = capture_path(room, frames=40, seed=3)[0]
         >>> rgb, depth = render_room(room, pose, default_intrinsics(32, 24), 32, 24)

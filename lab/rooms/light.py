@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.rooms.building import Light, Material
-from pointsplat_ns.rooms.raycast import Solids, chart_points, chart_size, dot, occluded, trace, unit
-from pointsplat_ns.rooms.textures import Canvas
+from lab.rooms.building import Light, Material
+from lab.rooms.raycast import Solids, chart_points, chart_size, dot, occluded, trace, unit
+from lab.rooms.textures import Canvas
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 

@@ -27,13 +27,13 @@ class StoppedError(Exception):
     """Work in a thread that was stopped because the whole program is."""
 
 
-def has_finished(run: Path, steps: int, instead: str = "name another --output") -> bool:
-    """Whether the training in a run's folder, which need not exist, has finished. A SceneError, with the advice
-    ``instead``, if a training of another number of steps has finished there."""
+def has_finished(run: Path, steps: int) -> bool:
+    """Whether the training in a run's folder, which need not exist, has finished. A SceneError if a training of another
+    number of steps has finished there."""
     done = _steps_if_finished(run)
     if done is not None and done != steps:
         wanted = f"expected one of {steps} or none"
-        raise SceneError(f"{run}: holds a finished training of {done} steps; {wanted}; {instead}")
+        raise SceneError(f"{run}: holds a finished training of {done} steps; {wanted}; name another --output")
     return done is not None
 
 
@@ -47,9 +47,10 @@ def remove_interrupted(run: Path) -> None:
 
 def _steps_if_finished(run: Path) -> int | None:
     try:
-        return open_run(run, need_data=False).steps_if_finished
+        known = open_run(run, need_data=False)
     except SceneError:  # no folder, or no checkpoint yet
         return None
+    return None if known.planned_steps is not None and known.step + 1 < known.planned_steps else known.step + 1
 
 
 def run(command: str, log: Path | None = None, threads: int | None = None, stop: threading.Event | None = None) -> None:

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from pointsplat_ns.rooms.raycast import Solids
-from pointsplat_ns.rooms.textures import Painter
+from lab.rooms.raycast import Solids
+from lab.rooms.textures import Painter
 
 Vec = tuple[float, float, float]
 

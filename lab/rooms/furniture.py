@@ -8,8 +8,8 @@ import colorsys
 
 import numpy as np
 
-from pointsplat_ns.rooms import textures as tex
-from pointsplat_ns.rooms.building import Builder, LocalFrame, Material, Vec
+from lab.rooms import textures as tex
+from lab.rooms.building import Builder, LocalFrame, Material, Vec
 
 
 def hsv(hue: float, saturation: float, value: float) -> tex.Color:

@@ -6,13 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
+from lab.rooms import furniture as fur
+from lab.rooms import textures as tex
+from lab.rooms.building import Builder, Light, LocalFrame, Material, Vec
+from lab.rooms.furniture import Palette, hsv
+from lab.rooms.light import BakedRoom, bake
+from lab.rooms.raycast import Solids
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.rooms import furniture as fur
-from pointsplat_ns.rooms import textures as tex
-from pointsplat_ns.rooms.building import Builder, Light, LocalFrame, Material, Vec
-from pointsplat_ns.rooms.furniture import Palette, hsv
-from pointsplat_ns.rooms.light import BakedRoom, bake
-from pointsplat_ns.rooms.raycast import Solids
 
 
 @dataclass(frozen=True)
