@@ -26,7 +26,6 @@ SHIPPED = (
     "pointsplat_ns/refiner/pretrained/refiner.safetensors",
     "pointsplat_ns/refiner/pretrained/CARD.md",
     "pointsplat_ns/system/include/lanes.h",
-    "pointsplat_ns/geometry/neighbours.cpp",
     "pointsplat_ns/metrics/structural_similarity.cpp",
     "pointsplat_ns/pruning/merging/matching.cpp",
     "pointsplat_ns/pruning/merging/pair_cost.cpp",
