@@ -52,7 +52,7 @@ ADAM = {"Adam": ("Optimizer.step#Adam.step",)}
 
 KINDS = {
     "ours": "ours",
-    "torch": "drawn by torch, without a compiler",
+    "torch": "drawn by torch, without kernels",
     "theirs": "with nerfstudio's Adam and SSIM as well",
 }
 

@@ -1,7 +1,7 @@
 """Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
 over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
 
-For float32 on a CPU, where the machine has a C++ compiler. :func:`~pointsplat_ns.rasterization` gives the same pictures
+For float32 on a CPU, where the kernels were built. :func:`~pointsplat_ns.rasterization` gives the same pictures
 to rounding.
 """
 

@@ -1,6 +1,6 @@
 // What one camera draws on which tile, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
 //
-// pictures.py compiles this file where there is a C++ compiler and calls it, then blends as for any picture. It does what
+// pictures.py calls this file where it was built, then blends as for any picture. It does what
 // projection.cpp, colors.cpp and tiles.cpp do one after the other, without what lies between.
 
 #include <utility>
