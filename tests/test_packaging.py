@@ -144,6 +144,12 @@ def test_installed_package_is_the_one_imported(installed):
     assert Path(where.strip()).is_relative_to(installed.environment)
 
 
+@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++"))), reason="there is no C++ compiler")
+def test_installed_kernels_are_built_and_used(installed):
+    code = "from pointsplat_ns.rasterizer.compiled import blending; print(repr(blending.KERNELS.why_missing))"
+    assert run(installed.python, "-c", code, cwd=installed.folder).strip() == "''"
+
+
 def test_installed_prune_makes_a_scene_small(installed):
     run(installed.pointsplat, "prune", "room.ply", "--keep", "10%", cwd=installed.folder)
     assert len(ps.load(installed.folder / "room_pruned.ply")) == GAUSSIANS // 10
