@@ -147,8 +147,9 @@ class _Trial:
         if self._why or self._tried == len(self.members):
             return self._why
         with self._lock:
-            if self._trying:  # what tries them calls them
-                return ""
+            # What tries them calls them; or another thread has tried them meanwhile.
+            if self._trying or self._why or self._tried == len(self.members):
+                return self._why
             self._trying = True
             try:
                 count = len(self.members)
@@ -172,8 +173,8 @@ _TRIAL = _Trial()
 _LIBRARY = library_path()
 
 
-@functools.cache
 def _why_not_loaded() -> str:
+    """The reason why the library cannot be loaded; empty if it can."""
     if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
         return "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
     if not _LIBRARY.is_file():

@@ -4,6 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,25 +19,20 @@ from pointsplat_ns.system.native import IS_X86, cpp_files, library_path
 HOW = "where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
 
 
-def not_loaded() -> str:
-    """The reason why the kernels cannot be loaded, asked for once more."""
-    return kernels._why_not_loaded.__wrapped__()
-
-
 def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path, monkeypatch):
     library = tmp_path / "kernels.0123456789abcdef.so"
     monkeypatch.setattr(kernels, "_LIBRARY", library)
-    assert not_loaded() == f"they were not built; {HOW}"
+    assert kernels._why_not_loaded() == f"they were not built; {HOW}"
     (tmp_path / "kernels.0123456789abcdee.so").touch()
-    assert not_loaded() == f"they were built from other sources; {HOW}"
+    assert kernels._why_not_loaded() == f"they were built from other sources; {HOW}"
     library.write_bytes(b"no library")
-    assert not_loaded().startswith(f"{library}: ")
+    assert kernels._why_not_loaded().startswith(f"{library}: ")
 
 
 @pytest.mark.skipif(not IS_X86, reason="other processors have all that the kernels need")
 def test_a_processor_without_avx2_is_told_before_the_library_ends_the_program(monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
-    assert "no AVX2" in not_loaded()
+    assert "no AVX2" in kernels._why_not_loaded()
 
 
 def test_kernels_that_disagree_with_torch_are_not_used_and_a_line_says_so(monkeypatch, caplog):
@@ -48,6 +46,21 @@ def test_kernels_that_disagree_with_torch_are_not_used_and_a_line_says_so(monkey
         assert not right.usable(True)
     (record,) = caplog.records
     assert "torch computes all" in record.getMessage() and record.getMessage().endswith(right.why_missing)
+
+
+def test_threads_that_wait_for_a_trial_take_its_verdict(monkeypatch):
+    monkeypatch.setattr(kernels, "_TRIAL", kernels._Trial())
+    monkeypatch.setattr(kernels, "_why_not_loaded", lambda: "")
+    begun, others = threading.Event(), ThreadPoolExecutor(1)
+
+    def disagree() -> bool:
+        begun.set()
+        time.sleep(0.3)  # the other thread waits meanwhile
+        return False
+
+    wrong = kernels.Kernels("drawing", Path("wrong.cpp"), disagree)
+    first = others.submit(wrong.usable, None)
+    assert begun.wait(10) and not wrong.usable(None) and not first.result(10)
 
 
 DRAW = """
