@@ -26,11 +26,13 @@ $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python 3.10, 3.11 or 3.12 found; install one or pass PYTHON=/path/to/python" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(STAMP): pyproject.toml | $(VENV)/bin/python
+$(STAMP): pyproject.toml setup.py | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
+# Compiles the kernels if their sources have changed; without a compiler torch computes everything.
 test: $(STAMP)
+	$(VENV)/bin/python setup.py build_ext --inplace
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(WORKERS)
 
 lint: $(STAMP)
@@ -46,4 +48,4 @@ demo: $(STAMP)
 	$(VENV)/bin/pointsplat demo
 
 clean:
-	rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis
+	rm -rf pointsplat_ns/system/kernels.*.so build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis

@@ -26,7 +26,6 @@ SHIPPED = (
     "pointsplat_ns/refiner/pretrained/refiner.safetensors",
     "pointsplat_ns/refiner/pretrained/CARD.md",
     "pointsplat_ns/system/include/lanes.h",
-    "pointsplat_ns/geometry/neighbours.cpp",
     "pointsplat_ns/metrics/structural_similarity.cpp",
     "pointsplat_ns/pruning/merging/matching.cpp",
     "pointsplat_ns/pruning/merging/pair_cost.cpp",
@@ -143,6 +142,12 @@ def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheels):
 def test_installed_package_is_the_one_imported(installed):
     where = run(installed.python, "-c", "import pointsplat_ns; print(pointsplat_ns.__file__)", cwd=installed.folder)
     assert Path(where.strip()).is_relative_to(installed.environment)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++"))), reason="there is no C++ compiler")
+def test_installed_kernels_are_built_and_used(installed):
+    code = "from pointsplat_ns.rasterizer.compiled import blending; print(repr(blending.KERNELS.why_missing))"
+    assert run(installed.python, "-c", code, cwd=installed.folder).strip() == "''"
 
 
 def test_installed_prune_makes_a_scene_small(installed):

@@ -1,27 +1,23 @@
-"""Compiled kernels that do not do what torch does are found out when they are first asked for, and not used."""
+"""Compiled kernels that do not do what torch does are found out when they are first asked for."""
 
 import shutil
+import subprocess
 
 import pytest
-import torch
 
-from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.pruning.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
-from pointsplat_ns.system.kernels import Kernels
+from pointsplat_ns.system.native import FLAGS, INCLUDE
 
-MODULES = (
-    *(blending, projection, colors, tiles, pictures, structural_similarity),
-    *(neighbours, pair_cost, matching, replacement, regrouping),
-)
+COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
-
-missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNELS.why_missing), "")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
 
 
-@pytest.mark.skipif(bool(missing), reason=missing)
+@needs_compiler
+@pytest.mark.skipif(bool(blending.KERNELS.why_missing), reason=blending.KERNELS.why_missing)
 @pytest.mark.parametrize(
     ("module", "right", "wrong", "times"),
     [
@@ -43,7 +39,6 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
         pytest.param(tiles, "level - dy * dy * inverse_yy", "level - dy * inverse_yy", 1, id="which tiles"),
         pytest.param(tiles, "tile_to(y + half_y,", "tile_to(y - half_y,", 1, id="a box"),
         pytest.param(blending, "transmittance_min ? alpha * t", "transmittance_min ? t", 1, id="visible pixels"),
-        pytest.param(neighbours, "dx * dx + dy * dy", "dx * dx + dy", 1, id="a distance"),
         pytest.param(covariance, "2 * (x * y - w * z)", "2 * (x * y)", 1, id="a rotation"),
         pytest.param(pair_cost, "ik = wi * ii + wj * ij", "ik = wi * ii", 1, id="a cost"),
         pytest.param(matching, "j > i ? (cost", "j < i ? (cost", 1, id="a pair"),
@@ -56,22 +51,20 @@ missing = next((module.KERNELS.why_missing for module in MODULES if module.KERNE
         ),
     ],
 )  # fmt: skip
-def test_kernels_that_do_not_do_as_torch_does_are_not_used(module, right, wrong, times, tmp_path, monkeypatch):
+def test_kernels_that_do_not_do_as_torch_does_are_found_out(module, right, wrong, times, tmp_path, monkeypatch):
     kernels = module.KERNELS
     texts = {path.name: path.read_text("utf-8") for path in (kernels.source, *kernels.source.parent.glob("*.h"))}
     assert sum(text.count(right) for text in texts.values()) == times
     for name, text in texts.items():
         (tmp_path / name).write_text(text.replace(right, wrong), "utf-8")
-    monkeypatch.setenv("POINTSPLAT_CACHE", str(tmp_path / "cache"))
-    changed = Kernels(kernels.what, tmp_path / kernels.source.name, kernels.agree)
-    monkeypatch.setattr(module, "KERNELS", changed)
-    with pytest.warns(UserWarning, match=f"stays with torch: what the compiler made of {kernels.source.name} does not"):
-        assert not changed.usable(True)
-    assert not changed.usable_for(None, torch.zeros(1, 3))
+    source, library = tmp_path / kernels.source.name, tmp_path / "spoiled.so"
+    subprocess.run([COMPILER, *FLAGS, "-shared", "-fPIC", f"-I{INCLUDE}", "-o", library, source], check=True)
+    assert kernels.agrees()
+    monkeypatch.setattr(kernels, "library", kernels.loaded(library))
+    assert not kernels.agrees()
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="there is no C++ compiler")
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__.rpartition(".")[2])
-def test_where_there_is_a_compiler_kernels_do_as_torch_does(module):
-    """Other tests of kernels skip where they cannot be used."""
-    assert module.KERNELS.why_missing == ""
+@needs_compiler
+def test_where_there_is_a_compiler_kernels_do_as_torch_does():
+    """Tests of kernels skip where none can be used; this one tells of a library that is missing or old."""
+    assert blending.KERNELS.why_missing == ""

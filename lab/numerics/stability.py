@@ -35,7 +35,7 @@ def main(
     Args:
         output: folder for stability.json, rasterizer.png and others.png; what is there is replaced.
         sweeps: which properties to drive.
-        compiled: measure the compiled rasterizer too, where there is a compiler.
+        compiled: measure the compiled rasterizer too, where it was built.
     """
     unknown = set(sweeps) - {sweep.name for sweep in SWEEPS}
     if unknown:

@@ -11,7 +11,6 @@ ratios.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -52,7 +51,6 @@ def parts_of(scene: Gaussians) -> dict[str, Part]:
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = group_moments(members, group, count)
     parts: dict[str, Part] = {
-        "neighbours": partial(other_neighbours, state.means.double(), MERGING.neighbours),
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
         "matching": lambda compiled: cheapest_pairs(near, costs.clone(), len(first), compiled=compiled),
         "replacement": lambda compiled: replace_pairs(state, first, second, MERGING, compiled),

@@ -1,7 +1,7 @@
 // Mean structural similarity of two images and its gradient by the first, for float32 on a CPU.
 //
-// structural_similarity.py says how it is defined, does the same in torch, compiles this file where there is a C++
-// compiler, and calls it. Images are planes of rows whose neighbours along a row lie ``step`` numbers apart: one for
+// structural_similarity.py says how it is defined, does the same in torch, and calls this file where
+// it was built. Images are planes of rows whose neighbours along a row lie ``step`` numbers apart: one for
 // planes of one channel, three where the channels of a pixel lie together. Threads take bands of rows, whose sums are
 // added up afterwards, so that the number of threads changes nothing. A band is worked on in blocks of columns, of which
 // the last eleven blurred rows stay in the fastest cache.

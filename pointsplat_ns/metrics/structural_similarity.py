@@ -2,7 +2,7 @@
 
 It is defined as in pytorch-msssim, which Splatfacto uses, and in :func:`pointsplat_ns.ssim`, which uses kornia. Both
 blur five maps one after the other. Here a compiled kernel (``structural_similarity.cpp``) does all at once, for float32
-on a CPU with a C++ compiler; elsewhere torch blurs them together, which takes about half the time of one by one. Tests
+on a CPU where it was built; elsewhere torch blurs them together, which takes about half the time of one by one. Tests
 check that all agree.
 """
 
@@ -33,7 +33,7 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
     Args:
         image: (B, C, H, W), in [0, 1].
         other: the same shape.
-        compiled: False leaves it to torch; True warns if it could not be compiled.
+        compiled: False leaves it to torch; True warns if there is no kernel.
 
     Returns:
         A scalar in [-1, 1]; 1 for identical images. Differentiable.

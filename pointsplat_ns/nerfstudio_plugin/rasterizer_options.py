@@ -24,8 +24,8 @@ class RasterizerOptions:
     backend: Literal["auto", "torch", "gsplat"] = "auto"
     """Rasterizer: torch runs everywhere, gsplat needs CUDA, auto takes gsplat if its CUDA kernels are available."""
     compiled: bool | None = None
-    """Draw with compiled kernels on a CPU: None if there is a C++ compiler (it takes four seconds, once), True warns if
-    there is none, False leaves it to torch, which is several times slower."""
+    """Draw with compiled kernels on a CPU: None if they were built, True warns if they were not, False leaves it to
+    torch, which is several times slower."""
     quality: Literal["exact", "balanced", "fast"] = "exact"
     """Accuracy that training gives up for speed (see docs/rasterizer.md). Evaluation is always exact."""
 

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import re
+import stat
 import tarfile
 import urllib.request
 import zlib
@@ -23,7 +24,6 @@ from typing import Any
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.system.native_libraries import cache_folder
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -148,6 +148,22 @@ def web_viewer(package: WebViewerPackage | None = None) -> WebViewer:
             with suppress(SceneError), replacing(cached, len(data)) as part:  # without room, the next call loads again
                 part.write_bytes(data)
     return _of_tarball(data, package)
+
+
+def cache_folder() -> Path | None:
+    """The folder for downloads, which is the user's alone: that of the environment variable POINTSPLAT_CACHE, by
+    default pointsplat_ns in the user's cache folder. None if there is none."""
+    named = os.environ.get("POINTSPLAT_CACHE")
+    home = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    folder = Path(named) if named else Path(home) / "pointsplat_ns"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about = folder.stat()
+    except (OSError, RuntimeError):  # the second: a home that is not known
+        return None
+    shared = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
+    return folder if ours and not shared and os.access(folder, os.W_OK) else None
 
 
 def known_digests() -> Mapping[str, str]:

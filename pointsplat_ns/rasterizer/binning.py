@@ -1,5 +1,5 @@
 """Chooses the code that finds the tiles of Gaussians: torch (:mod:`~pointsplat_ns.rasterizer.ellipses`), or kernels
-where there is a compiler (:mod:`~pointsplat_ns.rasterizer.compiled.tiles`)."""
+where they were built (:mod:`~pointsplat_ns.rasterizer.compiled.tiles`)."""
 
 from __future__ import annotations
 

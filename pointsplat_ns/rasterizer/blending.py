@@ -1,6 +1,6 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
-Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where there is a compiler
+Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where they were built
 (:mod:`~pointsplat_ns.rasterizer.compiled.blending`). What is evaluated per pixel, and how gradients are summed, stands
 in :mod:`~pointsplat_ns.rasterizer.quadratics`; which Gaussian is drawn on which pixel in
 :mod:`~pointsplat_ns.rasterizer.alpha`.

@@ -1,5 +1,5 @@
 """Colours of Gaussians from spherical harmonics: in torch (:mod:`~pointsplat_ns.rasterizer.spherical_harmonics`), or by
-compiled kernels where there is a compiler (:mod:`~pointsplat_ns.rasterizer.compiled.colors`)."""
+compiled kernels where they were built (:mod:`~pointsplat_ns.rasterizer.compiled.colors`)."""
 
 from __future__ import annotations
 

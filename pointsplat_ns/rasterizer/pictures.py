@@ -1,7 +1,7 @@
 """Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
 over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
 
-For float32 on a CPU, where the machine has a C++ compiler. :func:`~pointsplat_ns.rasterization` gives the same pictures
+For float32 on a CPU, where the kernels were built. :func:`~pointsplat_ns.rasterization` gives the same pictures
 to rounding.
 """
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
-from pointsplat_ns.rasterizer.compiled import blending
+from pointsplat_ns.rasterizer.compiled import blending, projection
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
 from pointsplat_ns.rasterizer.compiled.projection import camera_struct, count_meaningless, scene_struct
 from pointsplat_ns.rasterizer.constants import SLACK, TILE, Quality
@@ -54,7 +54,8 @@ def _placed(
     with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
         tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
-    channels, ranges, whole = (3 if colored else 0), -(-count // library.pointsplat_range()), _whole(camera[2])
+    channels, whole = (3 if colored else 0), _whole(camera[2])
+    ranges = -(-count // projection.KERNELS.library.pointsplat_range())
     table, depths = torch.empty(count, 6 + channels, **FLOATS), torch.empty(count, **DOUBLES)
     ids, boxes = (
         torch.empty(count, dtype=torch.int32, device="cpu"),
@@ -76,14 +77,14 @@ def _placed(
     drawn = int(counts.sum())
     order, strips = torch.empty(drawn, **INDICES), torch.empty(int(heights.sum()), 2, dtype=torch.int32, device="cpu")
     task.fill(order=order, strips=strips)
-    library.pointsplat_count(task)
+    library.pointsplat_count_placed(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
     if total > most_pairs:
         return None
     pairs = torch.empty(total, **INDICES)
     task.fill(offsets=offsets, pairs=pairs)
-    library.pointsplat_list(task, drawn, offsets[:-1].clone())
+    library.pointsplat_list_placed(task, drawn, offsets[:-1].clone())
     return inputs, pairs, offsets, tensors
 
 

@@ -164,7 +164,7 @@ def project(
     - The compensation is not below 0.005 (Mip-Splatting); gsplat lets it reach 0, where its gradient is unbounded.
     - No axis is drawn longer than 1e9 pixels (float32), so that no determinant overflows.
 
-    Done in torch (:mod:`~pointsplat_ns.rasterizer.ewa`), or by compiled kernels where there is a compiler
+    Done in torch (:mod:`~pointsplat_ns.rasterizer.ewa`), or by compiled kernels where they were built
     (:mod:`~pointsplat_ns.rasterizer.compiled.projection`); ``compiled`` is that of
     :func:`~pointsplat_ns.rasterization`.
 

@@ -126,8 +126,7 @@ def rasterization(
             below have no effect on gsplat.
         quality: thresholds that trade accuracy for speed, or their name; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
-            most four channels): None where the machine has a C++ compiler, which takes four seconds once; True warns
-            where it has none; False never.
+            most four channels): None where they were built; True warns where they were not; False never.
         memory_budget: bytes that lists of pairs may take before the image is drawn in several
             regions, one after the other; the image is the same to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.

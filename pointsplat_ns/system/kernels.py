@@ -1,4 +1,4 @@
-"""Functions of a C++ file of this package: built by the machine's compiler and tried when first used, and called on
+"""Functions of the C++ files of this package: built when the package is installed, tried when first used, and called on
 several threads.
 
 Structs and functions are read from the file and the headers beside it that it includes, so that nothing is declared
@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from pointsplat_ns.system.native_libraries import NativeCodeError, NoCompilerError, load_native
+from pointsplat_ns.system.native import IS_X86, library_path
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -132,70 +132,72 @@ SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
 
 
-class _Together:
-    """Kernels that are used all or not at all, because results would else be rounded by the one here and by torch
-    there."""
+class _Trial:
+    """Whether this machine can use the kernels: all or none, because results would else be rounded by the one here and
+    by torch there."""
 
-    def __init__(self, sources: Sequence[Path]):
-        self.sources, self.members = sources, list[Kernels]()
-        """C++ files that have to compile, and those of them with a module that was imported."""
+    def __init__(self) -> None:
+        self.members: list[Kernels] = []
+        """Those whose module was imported."""
         self._tried, self._trying, self._lock = 0, False, threading.RLock()
         self._why = ""
 
     def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
+        """The reason why this machine cannot use them; empty if it can. They are loaded if need be, and tried."""
         if self._why or self._tried == len(self.members):
             return self._why
         with self._lock:
-            if self._trying:  # what tries them calls them
-                return ""
+            # What tries them calls them; or another thread has tried them meanwhile.
+            if self._trying or self._why or self._tried == len(self.members):
+                return self._why
             self._trying = True
             try:
                 count = len(self.members)
-                self._why = self._tried_out()
+                self._why = _why_not_loaded() or self._why_not_right(self.members[self._tried : count])
                 self._tried = count
             finally:
                 self._trying = False
+            if self._why:
+                logger.warning(
+                    "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", self._why
+                )
         return self._why
 
-    def _tried_out(self) -> str:
-        try:
-            load_native(self.sources[0])
-            with ThreadPoolExecutor(os.cpu_count() or 1) as builders:  # compilers are processes of their own
-                [*builders.map(load_native, self.sources)]
-            wrong = next((each.source.name for each in self.members if not each.agrees), "")
-        except NoCompilerError as error:
-            return str(error)
-        except NativeCodeError as error:
-            why = str(error)
-        else:
-            if not wrong:
-                return ""
-            why = f"what the compiler made of {wrong} does not do what torch does"
-        logger.warning("compiled code is not used, torch computes all, slower and rounded otherwise: %s", why)
-        return why
+    def _why_not_right(self, members: list[Kernels]) -> str:
+        wrong = next((each.source.name for each in members if not each.agrees()), "")
+        return wrong and f"what the compiler made of {wrong} does not do what torch does"
 
 
-_PACKAGE = Path(__file__).parents[1]
+_TRIAL = _Trial()
+
+_LIBRARY = library_path()
 
 
-@functools.cache
-def _of_package() -> _Together:
-    return _Together(sorted(_PACKAGE.rglob("*.cpp")))
+def _why_not_loaded() -> str:
+    """The reason why the library cannot be loaded; empty if it can."""
+    if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
+        return "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
+    if not _LIBRARY.is_file():
+        others = any(_LIBRARY.parent.glob("kernels.*.so"))
+        found = "they were built from other sources" if others else "they were not built"
+        return f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
+    try:
+        ctypes.CDLL(str(_LIBRARY))
+    except OSError as error:
+        return " ".join(str(error).split())
+    return ""
 
 
 class Kernels:
     """Functions of a C++ file that are faster than torch, for a feature that warnings name by ``what``.
 
-    What the file declares is what Python calls. ``agree`` tells whether
-    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them. Those of
-    this package are used together or not at all.
+    What the file declares is what Python calls. ``agree`` tells whether the functions do what torch does, on a small
+    input, so that no miscompilation passes; it may call them. All are used together or not at all.
     """
 
     def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
-        self.what, self.source, self.agree = what, source, agree
-        self._together = _of_package() if _PACKAGE in source.parents else _Together([source])
-        self._together.members.append(self)
+        self.what, self.source, self._agree = what, source, agree
+        _TRIAL.members.append(self)
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
@@ -211,34 +213,35 @@ class Kernels:
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
-        """The functions, built if need be. Raises NativeCodeError if this machine cannot build them."""
-        library = load_native(self.source)
+        """The functions. Raises OSError if they were not built."""
+        return self.loaded(_LIBRARY)
+
+    def loaded(self, path: Path) -> ctypes.CDLL:
+        """The functions of a library. Raises OSError if it cannot be loaded."""
+        library = ctypes.CDLL(str(path))
         for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, parameters
         return library
 
-    @functools.cached_property
     def agrees(self) -> bool:
-        """Whether they do what torch does. Raises NativeCodeError as :attr:`library`."""
-        _ = self.library
+        """Whether they do what torch does. Raises OSError as :attr:`library`."""
         with torch.inference_mode(False):
-            return self.agree()
+            return self._agree()
 
     @property
     def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can. They are built if need be, and tried."""
-        return self._together.why_missing()
+        """The reason why this machine cannot use them; empty if it can. They are loaded if need be, and tried."""
+        return _TRIAL.why_missing()
 
     def usable(self, wanted: bool | None) -> bool:
-        """Whether to use them: not if ``wanted`` is False. None means that a machine without a compiler is no reason
-        for a warning."""
+        """Whether to use them: not if ``wanted`` is False. True warns where there are none."""
         if wanted is False:
             return False
         why = self.why_missing
         if why and wanted:
             # stacklevel 1: warnings of several kernels with one text are shown once
-            warnings.warn(f"{self.what} could not be compiled and stays with torch: {why}", stacklevel=1)
+            warnings.warn(f"{self.what} stays with torch: {why}", stacklevel=1)
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:

@@ -24,7 +24,7 @@ COMMANDS = (
     "prune scenes -o pruned --keep 4 --by paper --jobs 2",
     "compact scenes -o compacted --keep 4 --effort instant --jobs 2",
     "convert scenes converted --to .spz --jobs 2",
-    "prune scenes/1.ply -o merged.ply --keep 4",  # compiles the kernels
+    "prune scenes/1.ply -o merged.ply --keep 4",  # loads the kernels
 )
 """Commands that start processes."""
 
@@ -57,7 +57,7 @@ def pointsplat(folder: Path, words: str) -> subprocess.CompletedProcess[str]:
         f"#!{sys.executable}\nfrom pointsplat_ns.start import program\nif __name__ == '__main__':\n    program()\n"
     )
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "POINTSPLAT_CACHE": str(folder.parent / "cache")}
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     return subprocess.run(
         [sys.executable, script, *words.split()], cwd=folder, env=environment, capture_output=True, text=True
     )
@@ -105,7 +105,6 @@ def test_each_place_that_starts_processes_is_known():
     assert found == {
         "cli/demo.py",  # the programs of nerfstudio, beside this Python
         "system/memory.py",  # Python itself, with the same path
-        "system/native_libraries.py",  # a compiler on PATH
         "system/programs.py",  # a program in an isolated Python
         "system/workers.py",  # Python itself, without the current folder on its path
     }

@@ -5,12 +5,8 @@ import torch
 
 from making import assert_same_on_any_threads
 from pointsplat_ns.geometry import neighbours
-from pointsplat_ns.geometry.neighbours import KERNELS, NearestOf, PointTree, nearest, other_neighbours
+from pointsplat_ns.geometry.neighbours import NearestOf, nearest, other_neighbours
 from pointsplat_ns.geometry.transforms import curve_keys
-
-needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
-
-compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(None, marks=needs_compiler), False])
 
 
 def points(n, d=3, seed=0, dtype=torch.float32):
@@ -32,18 +28,16 @@ def test_the_nearest_are_those_of_brute_force(k, dtype):
     torch.testing.assert_close(distances, wanted_distances, rtol=1e-12, atol=0)  # both in float64
 
 
-@compiled_or_not
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, compiled, scale):
-    monkeypatch.setattr(neighbours, "TREE", neighbours.TreeSettings(queries_at_once=300))  # several pieces
+def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, scale):
+    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 300)  # several pieces
     where = scale * points(1000).double()
-    assert torch.equal(other_neighbours(where, 8, compiled).long(), by_brute_force(where, 9)[1][:, 1:])
+    assert torch.equal(other_neighbours(where, 8).long(), by_brute_force(where, 9)[1][:, 1:])
 
 
-@compiled_or_not
-def test_a_crowd_of_coincident_points_is_linked_all_the_way_through(compiled):
+def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
     """Their nearest ones alone may be the same few, from which no other is reached."""
-    near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4, compiled)
+    near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4)
     reached = torch.zeros(500, dtype=torch.bool)
     reached[0] = True
     for _ in range(500):
@@ -51,25 +45,21 @@ def test_a_crowd_of_coincident_points_is_linked_all_the_way_through(compiled):
     assert bool(reached.all())
 
 
-@compiled_or_not
 @pytest.mark.parametrize("n", [1, 7, 8, 9, 64, 65, 600, 5000])
-def test_the_nearest_of_other_places_are_those_of_brute_force(n, compiled):
+def test_the_nearest_of_other_places_are_those_of_brute_force(n):
     where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
     where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
     queries = where + 0.2 * points(n, seed=1).double()
-    near = NearestOf(where, 6, compiled)(queries, torch.randint(n, (n,), generator=torch.Generator().manual_seed(2)))
-    distances = (queries[:, None] - where[near.long()]).square().sum(2)
+    near = NearestOf(where, 6)(queries)
+    distances = (queries[:, None] - where[near]).square().sum(2)
     wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :6]
     torch.testing.assert_close(distances, wanted, rtol=1e-14, atol=0)  # float64, in another order
     assert all(len(row.unique()) == min(6, n) for row in near)
 
 
-@needs_compiler
 def test_any_number_of_threads_finds_the_same_neighbours():
     where = points(20_000).double()
-    assert_same_on_any_threads(
-        lambda: [other_neighbours(where, 6), PointTree(where).nearest(where, torch.zeros(20_000, dtype=torch.int64), 3)]
-    )
+    assert_same_on_any_threads(lambda: [other_neighbours(where, 6), NearestOf(where, 3)(where)])
 
 
 def test_the_curve_interleaves_the_bits_of_the_grid():
@@ -86,3 +76,11 @@ def test_the_curve_interleaves_the_bits_of_the_grid():
 def test_no_points_have_no_neighbours():
     distances, indices = nearest(points(0), 3)
     assert len(distances) == len(indices) == 0
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_where_there_are_fewer_others_a_points_own_index_stands_for_none(n):
+    near = other_neighbours(points(n).double(), 3)
+    assert near.shape == (n, 3) and near.dtype == torch.int32
+    for own, row in enumerate(near.tolist()):
+        assert sorted(row[: n - 1]) == [other for other in range(n) if other != own] and set(row[n - 1 :]) == {own}

@@ -56,10 +56,14 @@ def test_a_damaged_copy_in_the_cache_is_replaced(cache, monkeypatch):
     assert (cache / package_of(b"").tarball).read_bytes() == tarball()
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch):
-    monkeypatch.setenv("POINTSPLAT_CACHE", "/proc/nothing")
+def test_a_cache_that_cannot_be_written_or_that_others_can_write_to_is_done_without(cache, monkeypatch):
+    cache.mkdir()
+    cache.chmod(0o777)
     answering(monkeypatch, tarball())
-    assert web_viewer(package_of(tarball())) == small_viewer()
+    for folder in (cache, "/proc/nothing"):
+        monkeypatch.setenv("POINTSPLAT_CACHE", str(folder))
+        assert web_viewer(package_of(tarball())) == small_viewer()
+    assert files_below(cache) == []
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ PATHS = {
     "packed": TORCH,
     "dense": {"packed": False, **TORCH},
     "regions": {"memory_budget": 4000, **TORCH},
-    "compiled": {},  # where there is a compiler, in float32, of at most four channels
+    "compiled": {},  # where the kernels were built, in float32, of at most four channels
     "compiled in regions": {"memory_budget": 4000},
 }
 

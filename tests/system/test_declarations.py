@@ -3,18 +3,16 @@
 import ctypes
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 import torch
 
-import pointsplat_ns
-from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.pruning.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import functions_of, structs_of
+from pointsplat_ns.system.native import INCLUDE
 
 SHARED = """
 struct Hidden {
@@ -45,7 +43,7 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 }  // extern "C"
 """
 MODULES = (blending, colors, pictures, projection, tiles, structural_similarity)
-MERGING = (neighbours, covariance, matching, pair_cost, regrouping, replacement)
+MERGING = (covariance, matching, pair_cost, regrouping, replacement)
 KERNELS = [module.KERNELS for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
@@ -63,8 +61,7 @@ def test_structs_are_laid_out_as_the_compiler_lays_them_out(kernels, tmp_path):
         ]
     check = tmp_path / "check.cpp"
     check.write_text("\n".join(lines) + "\n", "utf-8")
-    shared = Path(pointsplat_ns.__file__).parent / "system" / "include"
-    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{shared}", str(check)], check=True)
+    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)], check=True)
 
 
 def test_what_is_shared_is_declared_with_its_types():

@@ -20,7 +20,6 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.compression.level_stream import Chunks
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
-from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.tensors import FLAGS, FLOATS
 
 PACKAGE = Path(ps.__file__).parent
@@ -183,8 +182,8 @@ def test_kernels_are_tried_the_same_whatever_torchs_settings(setting):
     if any(each.why_missing for each in kernels):
         pytest.skip(f"no kernels: {kernels[0].why_missing}")
     with SETTINGS[setting]():
-        missing = {each.source.name: Kernels(each.what, each.source, each.agree).why_missing for each in kernels}
-    assert len(missing) >= 10 and not any(missing.values())
+        agree = {each.source.name: each.agrees() for each in kernels}
+    assert len(agree) >= 10 and all(agree.values())
 
 
 def test_a_network_is_float32_on_the_device_that_was_asked_for():

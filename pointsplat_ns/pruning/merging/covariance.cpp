@@ -1,6 +1,6 @@
 // Covariances of Gaussians of a scene.
 //
-// covariance.py compiles this file where there is a C++ compiler and calls it; covariance.py does the same in torch, and
+// covariance.py calls this file where it was built; covariance.py does the same in torch, and
 // says why. All of it is float64.
 
 #include "lanes.h"

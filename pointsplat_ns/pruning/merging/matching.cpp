@@ -1,6 +1,6 @@
 // Which pairs go: the inner loops of matching.py, whose names are used here.
 //
-// matching.py compiles this file where there is a C++ compiler and calls it. The results are those of torch, to
+// matching.py calls this file where it was built. The results are those of torch, to
 // the bit.
 
 #include "lanes.h"

@@ -30,7 +30,7 @@ def cheapest_pairs(
             the mean of their two costs counts. They are overwritten.
         most: largest number of pairs.
         passes: number of passes.
-        compiled: False leaves it to torch; True warns if the kernels could not be compiled.
+        compiled: False leaves it to torch; True warns if there are no kernels.
 
     Returns:
         First and second members, (E,) int64 each; at least one pair if there is any neighbour and ``most`` is not 0.

@@ -1,6 +1,6 @@
 // What pairs cost, for float32 on a CPU.
 //
-// pair_cost.py compiles this file where there is a C++ compiler and calls it; pair_cost.py and projections.py do
+// pair_cost.py calls this file where it was built; pair_cost.py and projections.py do
 // the same in torch, say where the formulas are from, and have the names that are used here. A vector holds up to eight
 // neighbours of one Gaussian.
 

@@ -26,7 +26,7 @@ have a closed form:
 
 A_pq is the area of the summed covariance S_p + S_q, and d_pq the Mahalanobis distance of the centres under it.
 
-A compiled kernel (``pair_cost.cpp``) does all of it where there is a compiler, in float32. In torch below, E and H are
+A compiled kernel (``pair_cost.cpp``) does all of it where it was built, in float32. In torch below, E and H are
 written out in these overlaps: no difference of pictures or of colours is stored for each pair.
 
 Shapes: n Gaussians, m of them at once, k neighbours of each, C colour axes.
@@ -67,7 +67,7 @@ def pair_costs(
         near: (n, k) indices of the neighbours of each.
         settings: contrasts and cover of the cost, growth of the replacement.
         dtype: precision of the costs; torch projects Gaussians in float64.
-        compiled: False leaves it to torch; True warns if the kernels could not be compiled.
+        compiled: False leaves it to torch; True warns if there are no kernels.
 
     Returns:
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.

@@ -1,6 +1,6 @@
 // The group that each member fits best, of its own and the nearest.
 //
-// regrouping.py compiles this file where there is a C++ compiler and calls it; regrouping.py does the same in
+// regrouping.py calls this file where it was built; regrouping.py does the same in
 // torch, says where the formula is from, and has the names that are used here. All of it is float64.
 
 #include "lanes.h"

@@ -190,17 +190,17 @@ def best_groups(
         group: (n,) the group of each.
         groups: moments of the groups.
         settings: ``regrouping_candidates`` and ``regrouping_contrast``.
-        compiled: False leaves it to scipy and torch; True warns if the kernels could not be compiled.
+        compiled: False leaves it to torch; True warns if there are no kernels.
     """
     result = torch.empty_like(group)
-    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, settings.regrouping_candidates, compiled)
+    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, settings.regrouping_candidates)
     for these in members.pieces():
         piece, own = members[these], group[these]
-        near = nearest(piece.means, own)
+        near = nearest(piece.means)
         if KERNELS.usable(compiled):
-            result[these] = _by_kernels(piece, own, near, fits)
+            result[these] = _by_kernels(piece, own, near.int(), fits)
         else:
-            result[these] = fits.best_of(piece, torch.cat([own[:, None], near.long()], dim=1))
+            result[these] = fits.best_of(piece, torch.cat([own[:, None], near], dim=1))
     heaviest = torch.zeros(len(groups.mass), **DOUBLES).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
 

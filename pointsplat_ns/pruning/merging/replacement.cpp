@@ -1,6 +1,6 @@
 // What pairs become, and the Gaussians that stay as they are.
 //
-// replacement.py compiles this file where there is a C++ compiler and calls it. It and covariance.py do the same in torch,
+// replacement.py calls this file where it was built. It and covariance.py do the same in torch,
 // say where the formulas are from, and have the names that are used here. All of it is computed in float64, as there.
 
 #include "lanes.h"

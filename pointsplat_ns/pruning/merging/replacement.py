@@ -49,7 +49,7 @@ def replace_pairs(
         state: n Gaussians.
         first, second: (E,) each, indices of the members.
         settings: ``max_opacity``, ``growth_exponent``, ``max_growth_ratio``.
-        compiled: False leaves it to torch; True warns if the kernel could not be compiled.
+        compiled: False leaves it to torch; True warns if there is no kernel.
 
     Returns:
         The state of n - E Gaussians, and the share of the first member in each pair's mass, (E,) float32.

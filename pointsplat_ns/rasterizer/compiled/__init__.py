@@ -1,6 +1,6 @@
-"""The rasterizer's inner loops in C++, for float32 on a CPU with a C++ compiler; elsewhere torch does the same.
+"""The rasterizer's inner loops in C++, for float32 on a CPU where they were built; elsewhere torch does the same.
 
-Each module compiles the C++ file of its name: :mod:`~pointsplat_ns.rasterizer.compiled.projection`,
+Each module calls the C++ file of its name: :mod:`~pointsplat_ns.rasterizer.compiled.projection`,
 :mod:`~pointsplat_ns.rasterizer.compiled.colors`, :mod:`~pointsplat_ns.rasterizer.compiled.tiles` and
 :mod:`~pointsplat_ns.rasterizer.compiled.blending`.
 """

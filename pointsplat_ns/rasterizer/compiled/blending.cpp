@@ -1,6 +1,6 @@
 // The inner loops of blending for float32 on a CPU: the Gaussians of a tile front to back, and their gradients.
 //
-// blending.py compiles this file where there is a C++ compiler and calls it; blocks.py does the same in torch.
+// blending.py calls this file where it was built; blocks.py does the same in torch.
 // Both follow the rule of alpha.py and the algebra of quadratics.py, whose names are used here. A tile has 8 x 8 pixels; a
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.

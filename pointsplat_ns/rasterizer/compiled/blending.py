@@ -1,7 +1,6 @@
 """Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rasterizer.blocks` does it in torch.
 
-For float32 on a CPU, where the machine has a C++ compiler. Without a compiler, or if the compiled code does not
-agree with torch, torch blends.
+For float32 on a CPU. Where the kernels were not built, or do not agree with torch, torch blends.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def can_blend(colors: Tensor, wanted: bool | None) -> bool:
 
     Args:
         colors: of the projected Gaussians.
-        wanted: None where a machine without a compiler is no reason for a warning.
+        wanted: as for :meth:`~pointsplat_ns.system.kernels.Kernels.usable`.
     """
     # The kernels are made for colours and depth.
     return 1 <= colors.shape[1] <= 4 and KERNELS.usable_for(wanted, colors)

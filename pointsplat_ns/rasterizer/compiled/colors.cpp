@@ -1,6 +1,6 @@
 // Colours of Gaussians by spherical harmonics, for float32 on a CPU, and their gradients.
 //
-// colors.py compiles this file where there is a C++ compiler and calls it; spherical_harmonics.py does the same in
+// colors.py calls this file where it was built; spherical_harmonics.py does the same in
 // torch, says where the formulas are from, and has the names that are used here. Threads take ranges of Gaussians, and
 // nothing is summed across Gaussians, so that the number of threads changes nothing.
 

@@ -1,6 +1,6 @@
 """Colours by compiled kernels (``colors.cpp``), as :mod:`~pointsplat_ns.rasterizer.spherical_harmonics` makes them.
 
-For float32 on a CPU, where the machine has a C++ compiler.
+For float32 on a CPU, where the kernels were built.
 """
 
 from __future__ import annotations

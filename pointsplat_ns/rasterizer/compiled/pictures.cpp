@@ -1,6 +1,6 @@
 // What one camera draws on which tile, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
 //
-// pictures.py compiles this file where there is a C++ compiler and calls it, then blends as for any picture. It does what
+// pictures.py calls this file where it was built, then blends as for any picture. It does what
 // projection.cpp, colors.cpp and tiles.cpp do one after the other, without what lies between.
 
 #include <utility>
@@ -179,8 +179,6 @@ void sort_by_depth(int64_t* values, int64_t count) {
 
 extern "C" {
 
-int64_t pointsplat_range() { return RANGE; }
-
 // Places all Gaussians: everything but the pairs.
 void pointsplat_place(const Placing* task, int64_t* next) {
     switch (task->degree) {
@@ -194,7 +192,7 @@ void pointsplat_place(const Placing* task, int64_t* next) {
 
 // Orders the Gaussians by depth, equal ones by row, writes their strips, and counts the pairs of each tile into ``offsets``,
 // from its second place on.
-void pointsplat_count(const Placing* task) {
+void pointsplat_count_placed(const Placing* task) {
     const int64_t ranges = (task->scene.count + RANGE - 1) / RANGE;
     const double nearest = *std::min_element(task->nearest, task->nearest + ranges);
     int64_t drawn = 0;
@@ -220,7 +218,7 @@ void pointsplat_count(const Placing* task) {
 }
 
 // Writes the Gaussians of each tile, front to back, from ``free``, [tiles], on.
-void pointsplat_list(const Placing* task, int64_t drawn, int64_t* free) {
+void pointsplat_list_placed(const Placing* task, int64_t drawn, int64_t* free) {
     each_pair(
         *task, drawn, [](int64_t, int64_t, Strip*) {}, [&](int64_t row, int64_t tile) { task->pairs[free[tile]++] = row; });
 }

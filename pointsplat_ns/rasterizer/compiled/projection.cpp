@@ -1,6 +1,6 @@
 // Projection of Gaussians into the image of one camera, for float32 on a CPU, and its gradient.
 //
-// projection.py compiles this file where there is a C++ compiler and calls it; ewa.py does the same in torch,
+// projection.py calls this file where it was built; ewa.py does the same in torch,
 // explains the formulas, and has the names that are used here. Threads take ranges of Gaussians of fixed size, and nothing
 // is summed across ranges, so that the number of threads changes nothing.
 

@@ -1,6 +1,6 @@
 """Projection by compiled kernels (``projection.cpp``), as :mod:`~pointsplat_ns.rasterizer.ewa` does it in torch.
 
-For float32 on a CPU, where the machine has a C++ compiler.
+For float32 on a CPU, where the kernels were built.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 // The tiles that each Gaussian touches, for float32 on a CPU.
 //
-// compiled/tiles.py compiles this file where there is a C++ compiler and calls it; ellipses.py does the same in torch,
+// compiled/tiles.py calls this file where it was built; ellipses.py does the same in torch,
 // says where the formulas are from, and has the names that are used here.
 
 #include <vector>

@@ -1,7 +1,7 @@
 """The tiles that each Gaussian touches, by compiled kernels (``tiles.cpp``), as
 :mod:`~pointsplat_ns.rasterizer.ellipses` finds them.
 
-For float32 on a CPU, where the machine has a C++ compiler.
+For float32 on a CPU, where the kernels were built.
 """
 
 from __future__ import annotations

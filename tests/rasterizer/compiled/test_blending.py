@@ -1,10 +1,5 @@
 """Kernels of tiles, colours and blending against torch."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -65,41 +60,3 @@ def test_images_and_gradients_are_those_of_torch(options, kernel_calls):
 @needs_compiler
 def test_any_number_of_threads_draws_the_same_bits():
     assert_same_on_any_threads(lambda: draw(memory_budget=400_000))
-
-
-PROBE = """
-import torch, warnings
-from pointsplat_ns.rasterizer import rasterization
-eyes = torch.eye(4)[None], torch.eye(3)[None]
-scene = torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3)
-for compiled in (None, True):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        image, _, _ = rasterization(*scene, *eyes, 8, 8, compiled=compiled)
-    texts = {str(w.message) for w in caught}
-    print(len(texts), round(float(image.max()), 3), *texts, sep="|")
-"""
-
-
-@pytest.mark.parametrize("broken", ["no compiler", "no cache"])
-def test_without_a_compiler_torch_draws_and_a_line_says_why_if_asked(broken, tmp_path):
-    changes = {"CXX": "/nonexistent/c++"} if broken == "no compiler" else {"POINTSPLAT_CACHE": "/proc/nothing"}
-    environment = {**os.environ, "POINTSPLAT_CACHE": str(tmp_path / "cache"), **changes}
-    root = str(Path(blending.__file__).parents[3])
-    ran = subprocess.run(
-        [sys.executable, "-c", PROBE],
-        env=environment,
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=True,
-    )
-    first, second = ran.stdout.strip().splitlines()[-2:]
-    assert first == "0|0.635"
-    if broken == "no cache" and not blending.KERNELS.why_missing:  # built for this process alone
-        assert second == first
-    else:
-        count, value, message = second.split("|")
-        reason = "which is not there" if broken == "no compiler" else "compiler"
-        assert (count, value) == ("1", "0.635") and "stays with torch" in message and reason in message
