@@ -20,13 +20,13 @@ from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, need_named_data
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import CAMERA_PATH, FilmSettings, camera_path
-from pointsplat_ns.viewing.film import FilmScenes, SplitScreen, render_frames
-from pointsplat_ns.viewing.video import check_output, write_frames
+from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
+from pointsplat_ns.pages.film import FilmScenes, SplitScreen, render_frames
+from pointsplat_ns.pages.video import check_output, write_frames
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.viewing.server import Served
+    from pointsplat_ns.pages.server import Served
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -157,8 +157,8 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    from pointsplat_ns.viewing.page_server import PageServer, is_stream_with_page
-    from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
+    from pointsplat_ns.pages.stream_server import PageServer, is_stream_with_page
+    from pointsplat_ns.pages.viewer import ViewedScene, Viewer
 
     upward = up_named(up)
     need_named_data(scene, data)

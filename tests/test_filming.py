@@ -14,7 +14,7 @@ import pointsplat_ns as ps
 from making import ball, decoded, run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.transforms import viewmats_to_opengl
-from pointsplat_ns.viewing.film import to_uint8
+from pointsplat_ns.pages.film import to_uint8
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
 

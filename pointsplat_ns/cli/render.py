@@ -56,7 +56,7 @@ def render(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.files import bytes_text
-    from pointsplat_ns.viewing.video import kind_of
+    from pointsplat_ns.pages.video import kind_of
 
     start = time.perf_counter()
     check_poses(poses)

@@ -93,7 +93,7 @@ def write_page(
         while True:
             flight = frame.data(included)
             values: dict[str, Any] = {"title": title, "rows": rows, "notes": notes, "missing": missing}
-            values |= {"flight": flight, "data": {"flight": flight}}
+            values |= {"flight": flight, "data": {"flight": flight}, "live": False, "drops": ()}
             text = page("scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
             if len(text) <= 1e6 * limit_mb:
                 break

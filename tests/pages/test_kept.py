@@ -11,8 +11,8 @@ import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.compression.level_stream import Chunks
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.viewing import selection as module
-from pointsplat_ns.viewing.selection import Selection
+from pointsplat_ns.pages import selection as module
+from pointsplat_ns.pages.kept import Selection
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def patient(scene, news) -> Iterator[Selection]:
 def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp_path, monkeypatch):
     ps.lod(scene, [1.0, 0.5, 0.1], folder=tmp_path / "room", stream=Chunks())
     shown = []
-    monkeypatch.setattr("pointsplat_ns.viewing.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
+    monkeypatch.setattr("pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
     ps.open_viewer(tmp_path / "room")
     (viewed,) = shown
     made = Selection(viewed.scene, viewed.source, lambda picture: None, rest=0.0, levels=viewed.levels)

@@ -18,10 +18,10 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing import server
-from pointsplat_ns.viewing import viewer as viewing
-from pointsplat_ns.viewing.server import LOCAL, refusal
-from pointsplat_ns.viewing.viewer import Viewer
+from pointsplat_ns.pages import server
+from pointsplat_ns.pages import viewer as viewing
+from pointsplat_ns.pages.server import LOCAL, refusal
+from pointsplat_ns.pages.viewer import Viewer
 from serving import answer
 
 CLIENT = "a page of the tests"

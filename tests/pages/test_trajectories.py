@@ -10,9 +10,9 @@ import torch
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.viewing import camera_path
-from pointsplat_ns.viewing.camera_path import read_path
-from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
+from pointsplat_ns.pages import camera_path
+from pointsplat_ns.pages.camera_path import read_path
+from pointsplat_ns.pages.trajectories import along, fitted, orbit, up_of, walk
 
 
 def views_at(eyes: torch.Tensor, targets: torch.Tensor, up: torch.Tensor | None = None) -> ps.Views:
