@@ -19,10 +19,10 @@ from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, need_named_data
-from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
 from pointsplat_ns.pages.film import FilmScenes, SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
+from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.pages.trajectories import along, fitted, orbit, walk
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
 

@@ -20,9 +20,9 @@ from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import Megabytes
-from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
 
 AXIS = "-x"
 """Up in these tests, which no estimate would choose."""

@@ -6,7 +6,6 @@ Pictures are compared with those of the package's own rasterizer.
 import base64
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import chromium, complaints
+from browser import before_pages_load, chromium, complaints
 from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
@@ -46,16 +45,6 @@ def opened(browser, written) -> Iterator:
     shrink(browser)
     yield browser
     assert complaints(browser) == []
-
-
-@contextmanager
-def before_pages_load(browser, script: str) -> Iterator[None]:
-    """Run a script in every page before its own."""
-    added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
-    try:
-        yield
-    finally:
-        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
 
 
 def ring_of_views(**changes) -> ps.Views:
