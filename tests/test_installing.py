@@ -78,7 +78,6 @@ FAILS = {
     "make-refiner -o made": "training needs nerfstudio, which is not installed; "
     "pip install 'pointsplat-ns[nerfstudio]' adds it",
     "train capture": "training a scene needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
-    "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
 }
 """Commands that something is missing for, and what they say."""
 
