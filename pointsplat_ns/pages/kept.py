@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import keep_usable
+from pointsplat_ns.io.files import keep_usable, one_line
 from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import resolve_keep, select
@@ -140,7 +140,7 @@ class Levels:
                 continue
             except (PointSplatError, MemoryError, RuntimeError) as error:
                 chosen = self.scene[select(self._scores, self._count(percent))]
-                level = Level(chosen, f"chosen by coverage, because merging failed: {error}")
+                level = Level(chosen, f"chosen by coverage, because merging failed: {one_line(error)}")
             with self._changed:
                 self._keep(percent, level)
                 self._wanted = None if self._wanted == percent else self._wanted

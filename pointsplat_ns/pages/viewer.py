@@ -267,7 +267,7 @@ def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
     scripts = (*((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()), *(("drop.js",) if drops else ()))
     text = page(
         "scene.html", scripts, with_workers=True, connects=True, title=title, flight=flight, live=True,
-        drops=READABLE_NAMES if drops else (), notes=(), rows=(), missing="", data={"flight": flight},
+        drops=READABLE_NAMES if drops else (), notes=(), missing="", data={"flight": flight},
     )  # fmt: skip
     return text.encode("utf-8")
 

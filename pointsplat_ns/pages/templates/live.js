@@ -5,18 +5,23 @@ const REST = 600; // milliseconds until a share counts as chosen: then its Gauss
 const QUICK = 360; // pixels of the longer side of a picture while the camera moves
 
 class Live extends Flight {
+  start() {
+    let why;
+    try {
+      if (location.search !== "?pictures") return super.start();
+    } catch (error) {
+      why = error;
+    }
+    this.drawer = new Pictures(this.canvas, why, (values) => this.picture(values));
+  }
+
   async load() {
     this.kept = [...this.data.kept];
     this.changes = this.kept.map(() => 0); // of each slider
     this.asking = 0;
     this.whole = [];
     this.root = this.part.stage.parentElement;
-    try {
-      if (location.search === "?pictures") throw new Error("This page shows pictures that pointsplat view draws.");
-      this.start();
-    } catch (error) {
-      this.drawer = new Pictures(this.canvas, error, (values) => this.picture(values));
-    }
+    this.start();
     for (let index = 0; index < this.kept.length; index++) {
       this.say(`Loading ${this.data.scenes[index].name} …`);
       const { state, spz } = await this.ask(index, "");
@@ -83,7 +88,8 @@ class Live extends Flight {
   }
 
   compare() {
-    for (const part of [this.part.wipe, this.part.stage.querySelector(".flight-name.right")]) part.hidden = this.scenes.length < 2;
+    const parts = [this.part.wipe, this.part.stage.querySelector(".flight-name.right")];
+    for (const part of parts) part.hidden = this.scenes.length < 2;
   }
 
   describe(index, { amount, command }) {
@@ -103,15 +109,15 @@ class Live extends Flight {
   }
 
   async ask(index, have) {
-    const percent = this.kept[index], wanted = { scene: index, percent, have, spz: Boolean(this.drawer.gl) && (percent < 100 || !this.whole[index]) };
-    const answer = await this.post("/scene", wanted);
+    const percent = this.kept[index], isHere = percent === 100 && this.whole[index];
+    const answer = await this.post("/scene", { scene: index, percent, have, spz: Boolean(this.drawer.gl && !isHere) });
     return { state: JSON.parse(answer.headers.get("X-State")), spz: new Uint8Array(await answer.arrayBuffer()) };
   }
 
   // A picture of what the camera sees; null if it has moved meanwhile.
   async picture(values) {
     try {
-      const answer = await this.post("/picture", { ...values, wipe: this.scenes.length > 1 ? this.wipe : 1, kept: this.kept });
+      const answer = await this.post("/picture", { ...values, wipe: this.wipe, kept: this.kept });
       this.say("");
       return answer.status === 200 ? createImageBitmap(await answer.blob()) : null;
     } catch (error) {
