@@ -19,14 +19,14 @@ from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, need_named_data
+from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
+from pointsplat_ns.pages.film import FilmScenes, SplitScreen, render_frames
+from pointsplat_ns.pages.video import check_output, write_frames
 from pointsplat_ns.system.progress import Progress, tracked
-from pointsplat_ns.viewing.camera_path import CAMERA_PATH, FilmSettings, camera_path
-from pointsplat_ns.viewing.film import FilmScenes, SplitScreen, render_frames
-from pointsplat_ns.viewing.video import check_output, write_frames
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.viewing.server import Served
+    from pointsplat_ns.pages.server import Served
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -36,7 +36,7 @@ def render_path(
     output: str | Path,
     other: Source | None = None,
     *,
-    path: str | Path | Views = "auto",
+    path: str | Path | None = None,
     views: Views | str | Path | None = None,
     split: SplitScreen = "side-by-side",
     labels: Sequence[str] | None = None,
@@ -56,14 +56,13 @@ def render_path(
         output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
             when it is complete.
         other: a second scene in the same frame, to compare with.
-        path: "dataset" goes exactly through the poses of the run's dataset; "walk" past sampled views, smoothly and
-            upright; "orbit" about their common content, or a turn on the spot in a room; "auto" is "dataset" if there
-            is one, else "walk". Or a camera path that nerfstudio's viewer saved (JSON), or views to go through.
-        views: views for "dataset", "walk" and "orbit", in place of the dataset's poses: views, or a file of
-            cameras (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
+        path: a camera path that nerfstudio's viewer saved (JSON). By default the film goes exactly through the views
+            or the poses of the run's dataset; without these around an object, or past what shows most of a room.
+        views: views to go through, in place of the dataset's poses: views, or a file of cameras (``cameras.json`` of
+            3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
         split: layout of two scenes: "side-by-side", or "wipe" with a moving line between them.
         labels: labels of two scenes; by default their names and counts. An empty list writes none.
-        up: the axis that is up in the scene ("z", "-y"), for walks and orbits; by default the scene's own, or
+        up: the axis that is up in the scene ("z", "-y") for a film without views; by default the scene's own, or
             estimated.
         data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
@@ -79,7 +78,7 @@ def render_path(
 
     Raises:
         SceneError: if a scene is not usable, or the output cannot be written.
-        DataError: if there are no views for a path, the saved path is not usable, or most views of a file see nothing
+        DataError: if nothing of the scene is visible, the saved path is not usable, or most views of a file see nothing
             of the scene.
         PointSplatError: if a size, speed or length is not valid.
 
@@ -106,11 +105,10 @@ def render_path(
         poses = poses.relative_to(loaded[0].offset)
         poses.check(loaded[0])
         given = poses.views.resized(CAMERA_PATH.photo_side)
-    way: str | Path = path if not isinstance(path, Views) else "dataset"
-    if given is not None and kind == "frames" and seconds is None and way in ("auto", "dataset"):
+    if given is not None and kind == "frames" and seconds is None and path is None:
         settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))
-    view_source = _source(scene, loaded[0], path if isinstance(path, Views) else given, data)
-    chosen = camera_path(loaded[0], view_source, way, settings, kind == "picture", upward)
+    view_source = _source(scene, loaded[0], given, data)
+    chosen = camera_path(loaded[0], view_source, path, settings, kind == "picture", upward)
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
     film = FilmScenes(loaded[0], loaded[1] if other is not None else None, split, labels if other else ())
@@ -128,8 +126,8 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Served:
-    """Show a scene, or two scenes with the same camera, in the browser. This machine's processor draws; no GPU is
-    needed.
+    """Show a scene, or two scenes with the same camera, in the browser, which draws. Browsers without WebGL 2 show
+    pictures that this machine's processor draws.
 
     It opens upright, at the view that shows most of the scene, or the whole of an object.
 
@@ -157,8 +155,8 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    from pointsplat_ns.viewing.page_server import PageServer, is_stream_with_page
-    from pointsplat_ns.viewing.viewer import ViewedScene, Viewer
+    from pointsplat_ns.pages.stream_server import PageServer, is_stream_with_page
+    from pointsplat_ns.pages.viewer import ViewedScene, Viewer
 
     upward = up_named(up)
     need_named_data(scene, data)

@@ -74,7 +74,6 @@ RUNS = {
 FAILS = {
     "train capture": "training a scene needs nerfstudio, which is not installed; "
     "pip install 'pointsplat-ns[nerfstudio]' adds it",
-    "render run -o run.mp4 --path dataset": "needs nerfstudio, which is not installed; pip install 'pointsplat-ns[",
 }
 """Commands that something is missing for, and what they say."""
 

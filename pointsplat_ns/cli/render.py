@@ -17,7 +17,7 @@ def render(
     scene: Scene,
     other: tyro.conf.Positional[Path | None] = None,
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
-    path: str = "auto",
+    path: Path | None = None,
     poses: Poses = None,
     split: Literal["side-by-side", "wipe"] = "side-by-side",
     labels: tuple[str, ...] | None = None,
@@ -37,15 +37,14 @@ def render(
         other: a second scene in the same frame, to compare with.
         output: .mp4 for a video, a folder for PNG frames, .png for the first frame alone; by default a video beside the
             scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is complete.
-        path: dataset (exactly through the poses of the run's dataset), walk (past sampled views), orbit (about what
-            they show), auto (dataset if there is one, else walk), or a camera path that nerfstudio's viewer saved
-            (.json).
+        path: a camera path that nerfstudio's viewer saved (.json). By default the film goes exactly through the poses;
+            without poses around an object, or past what shows most of a room.
         poses: a file of cameras, by default those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
             or the folder of a COLMAP project. A folder then gets one frame for each, unless --seconds is given.
         split: layout of two scenes.
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
-        up: the axis that is up in the scene, for walks and orbits: x, y, z, -x, -y or -z; by default the file's own,
-            or an estimate. Write --up=-y for a negative axis.
+        up: the axis that is up in the scene, for a film without poses: x, y, z, -x, -y or -z; by default the file's
+            own, or an estimate. Write --up=-y for a negative axis.
         data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels; by default in the proportion of the path or the photos.
@@ -56,7 +55,7 @@ def render(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.io.files import bytes_text
-    from pointsplat_ns.viewing.video import kind_of
+    from pointsplat_ns.pages.video import kind_of
 
     start = time.perf_counter()
     check_poses(poses)

@@ -17,8 +17,9 @@ def view(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> None:
-    """Look at a scene in the browser, or at two from the same camera. It is drawn by this machine's processor, no GPU
-    is needed: small while the camera moves, whole once it is still. Ctrl-C ends it.
+    """Look at a scene in the browser, or at two from the same camera. A slider keeps less of the Gaussians, merged as
+    `prune` does. The browser draws; one without WebGL 2 shows pictures that this machine's processor draws. Ctrl-C ends
+    it.
 
     The folder of a stream with a page (`pointsplat lod --stream --html`) alone is shown by that page, which the browser
     draws; its lod-meta.json as other scenes are.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
@@ -12,7 +11,7 @@ from pointsplat_ns.io.files import logger, replacing
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pruning import need_usable, ply_bytes
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.views import Views
 
@@ -80,7 +79,6 @@ def write_page(
     scenes = [scene.at_offset(scenes[0].offset) for scene in scenes]
     for scene in scenes:
         need_usable(scene)
-    rows = [_row(name, scene) for name, scene in zip(names, scenes, strict=True)]
     with progress_bar(progress) as report:
         report("looking for views", 0.0)
         frame = FlightFrame.of(scenes[0], views, upward)
@@ -92,9 +90,10 @@ def write_page(
         missing = ""
         while True:
             flight = frame.data(included)
-            values: dict[str, Any] = {"title": title, "rows": rows, "notes": notes, "missing": missing}
-            values |= {"flight": flight, "data": {"flight": flight}}
-            text = page("scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, **values).encode("utf-8")
+            text = page(
+                "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, title=title, notes=notes,
+                missing=missing, flight=flight, data={"flight": flight}, live=False, drops=(),
+            ).encode("utf-8")  # fmt: skip
             if len(text) <= 1e6 * limit_mb:
                 break
             included, missing = _without_the_largest(included, path, len(text), limit_mb)
@@ -120,14 +119,3 @@ def _without_the_largest(
         raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
     largest = max(included, key=lambda scene: len(scene["spz"]))
     return [scene for scene in included if scene is not largest], f"{largest['name']} is left out: with it {excess}"
-
-
-def _row(name: str, scene: Gaussians) -> dict[str, Any]:
-    """The row of a scene in the table of the page."""
-    megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
-    return {
-        "name": name,
-        "gaussians": f"{len(scene):,}",
-        "sh_degree": scene.sh_degree,
-        "ply": f"{megabytes:.2f}",
-    }

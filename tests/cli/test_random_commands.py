@@ -19,7 +19,7 @@ import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.cli import COMMANDS, _command, main
 from pointsplat_ns.cli.help import STATUSES
-from pointsplat_ns.viewing.viewer import Viewer
+from pointsplat_ns.pages.viewer import Viewer
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 

@@ -20,9 +20,9 @@ from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import Megabytes
-from pointsplat_ns.viewing.camera_path import FilmSettings, camera_path
 
 AXIS = "-x"
 """Up in these tests, which no estimate would choose."""
@@ -113,11 +113,10 @@ def test_it_counts_as_a_named_axis_does_wherever_up_counts(tmp_path, room):
     for known in (None, ps.sample_views(room, 8, 64, 48)):
         frame, named = FlightFrame.of(declared, known), FlightFrame.of(room, known, up)
         assert str(frame.up) == AXIS and torch.equal(frame.views.viewmats, named.views.viewmats)
-        path, wanted = (
-            camera_path(scene, ViewSource(scene, known), "orbit", film, up=axis)
-            for scene, axis in ((declared, None), (room, up))
-        )
-        assert torch.equal(path.views.viewmats, wanted.views.viewmats)
+    path, wanted = (
+        camera_path(scene, ViewSource(scene), None, film, up=axis) for scene, axis in ((declared, None), (room, up))
+    )
+    assert torch.equal(path.views.viewmats, wanted.views.viewmats)
     page = ps.write_page(declared, tmp_path / "room.html")
     assert json.dumps({"up": up.direction.tolist()})[1:-1].replace(" ", "") in page.read_text().replace(" ", "")
 

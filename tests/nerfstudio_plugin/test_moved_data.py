@@ -49,7 +49,7 @@ COMMANDS = {
     "prune": "RUN --keep 50% --by lightgaussian -o OUT/a.ply --json",
     "compact": "RUN --keep 50% --effort instant -o OUT/a.ply --json",
     "lod": "RUN --levels 50% -o OUT/lod",
-    "render": "RUN --path dataset --seconds 0.1 -o OUT/a.png",
+    "render": "RUN --seconds 0.1 -o OUT/a.png",
     "tradeoff": "RUN --keep 10% --views 2 --repairs none -o OUT/trade",
     "info": "RUN --views OUT/a.png",
 }

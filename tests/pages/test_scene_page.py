@@ -73,7 +73,6 @@ def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms
     sentence = f"dense is left out: with it the page would have {both:.1f} MB, more than the {both - 0.01:g} MB allowed"
     assert f'<p class="note">{sentence}.</p>' in path.read_text("utf-8") and sentence in caplog.text
     assert [len(scene) for scene in scenes_in(path, tmp_path)] == [len(rooms[1])]
-    assert f"<td>{len(rooms[0]):,}</td>" in path.read_text("utf-8"), "the table still has both"
     ps.write_page(rooms, path, ["dense", "compact"], title="room", views=room_views(), limit_mb=both + 0.01)
     assert path.read_bytes() == written.read_bytes()
 

@@ -42,6 +42,16 @@ def chromium() -> "Iterator[Chrome]":
         browser.quit()
 
 
+@contextmanager
+def before_pages_load(browser, script: str) -> Iterator[None]:
+    """Run a script in every page before its own."""
+    added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
+    try:
+        yield
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
 def complaints(browser: "Chrome") -> list[str]:
     """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade. What a
     graphics driver says of its speed is left out."""

@@ -2,7 +2,7 @@
 
 import http.client
 
-from pointsplat_ns.viewing.server import Served
+from pointsplat_ns.pages.server import Served
 
 
 def answer(viewer: Served, method: str, path: str, body: bytes | None = None, **headers: str):

@@ -12,6 +12,17 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * Math.cos(angle) + across[i] * Math.sin(angle) + axis[i] * along);
 }
 
+const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]; // each a quarter turn on
+const NAMES = ["x", "y", "z", "-x", "-y", "-z"];
+const ALONG = 1 - 1e-6; // cosine from which on a direction is an axis
+
+// The directions that may be up: the given one, then the world's axes, from the one after the nearest on.
+function upsFrom(up) {
+  const along = AXES.map((axis) => dot(axis, up)), nearest = along.indexOf(Math.max(...along));
+  const others = AXES.map((_, step) => AXES[(nearest + 1 + step) % 6]);
+  return [up, ...(along[nearest] > ALONG ? others.slice(0, 5) : others)];
+}
+
 const STEEPEST = 0.99; // cosine between the camera's direction and up: farther, up would change sides
 const NEAREST = 0.1; // to what the camera circles about
 
@@ -39,9 +50,13 @@ class Camera {
     this.down = cross(this.ahead, this.right);
   }
 
-  // Look at the same, upside down.
-  turnOver() {
-    for (const axis of ["up", "right", "down"]) this[axis] = plus([0, 0, 0], this[axis], -1);
+  // Stand upright with another up: about the content's middle if the camera circles, else on the spot.
+  stand(up, circles) {
+    const across = cross(this.up, up), angle = Math.atan2(Math.hypot(...across), dot(this.up, up));
+    const moved = (vector) => turned(vector, unit(across), angle);
+    if (circles) this.eye = moved(this.eye);
+    for (const axis of ["right", "down", "ahead"]) this[axis] = moved(this[axis]);
+    this.up = up;
   }
 
   // Circle about what is ahead: turn, and go aside by as much.

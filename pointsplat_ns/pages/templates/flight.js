@@ -12,7 +12,8 @@ class Flight {
     this.part = Object.fromEntries([...root.querySelectorAll("[data-flight]")].map((part) => [part.dataset.flight, part]));
     this.canvas = this.part.canvas;
     this.camera = new Camera();
-    this.over = false;
+    this.ups = upsFrom(data.up);
+    this.upright = 0; // which of these
     this.place(0);
     this.controls = new Controls(this.canvas, this.camera, () => this.change());
     this.scenes = [];
@@ -26,22 +27,7 @@ class Flight {
 
   async open() {
     try {
-      if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene.");
-      this.drawer = new Drawer(this.canvas);
-      this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics driver has stopped. Load the page again."));
-      for (const { name, spz } of this.data.scenes) {
-        this.say(`Unpacking ${name} …`);
-        await new Promise((done) => setTimeout(done)); // the text is seen
-        const unpacked = await unpackSpz(spz).catch((error) => {
-          throw new Error(`The scene in this page is damaged: ${error.message}`);
-        });
-        const scene = this.drawer.add(unpacked);
-        scene.sorting = new Sorting(unpacked.positions, (order) => {
-          scene.setOrder(order);
-          this.request();
-        });
-        this.scenes.push(scene);
-      }
+      await this.load();
     } catch (error) {
       this.scenes = [];
       return this.say(error.message);
@@ -50,6 +36,38 @@ class Flight {
     this.opened = true;
     this.listen();
     this.change();
+  }
+
+  start() {
+    if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene.");
+    this.drawer = new Drawer(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics driver has stopped. Load the page again."));
+  }
+
+  async load() {
+    this.start();
+    for (const { name, spz } of this.data.scenes) {
+      this.say(`Unpacking ${name} …`);
+      await new Promise((done) => setTimeout(done)); // the text is seen
+      this.scenes.push(await this.unpacked(spz, "The scene in this page is damaged"));
+    }
+  }
+
+  // What is drawn of an SPZ file, once it can be seen.
+  async unpacked(spz, failed) {
+    const content = await unpackSpz(spz).catch((error) => {
+      throw new Error(`${failed}: ${error.message}`);
+    });
+    const scene = this.drawer.add(content);
+    await new Promise((sorted) => {
+      scene.sorting = new Sorting(content.positions, (order) => {
+        scene.setOrder(order);
+        sorted();
+        this.request();
+      });
+      scene.sorting.sort(this.seenFrom);
+    });
+    return scene;
   }
 
   say(text) {
@@ -64,11 +82,12 @@ class Flight {
     this.setDrag(this.data.drag);
     part.drag.addEventListener("change", (event) => this.setDrag(event.target.value));
     part.reset.addEventListener("click", () => this.reset());
-    part.over.addEventListener("click", () => this.turnOver());
+    part.turn.addEventListener("click", () => this.turnUp());
     part.full.addEventListener("click", () => this.fill());
     part.views.querySelectorAll("button").forEach((button, index) => button.addEventListener("click", () => this.goTo(index)));
     this.canvas.addEventListener("keydown", (event) => this.press(event));
-    if (this.scenes.length > 1) this.listenToWipe();
+    if (part.wipe) this.listenToWipe();
+    this.sayUp();
   }
 
   listenToWipe() {
@@ -93,14 +112,14 @@ class Flight {
     const number = Number(event.key);
     if (number >= 1 && number <= this.data.views.length) this.goTo(number - 1);
     else if (event.code === "KeyR") this.reset();
-    else if (event.code === "KeyT") this.turnOver();
+    else if (event.code === "KeyT") this.turnUp();
     else if (event.code === "KeyF") this.fill();
     else if (event.key === "[" || event.key === "]") this.setWipe(this.wipe + (event.key === "[" ? -0.05 : 0.05));
   }
 
   // Parts at a share of the width, from the left.
   setWipe(share) {
-    if (this.scenes.length < 2) return;
+    if (!this.part.wipe) return;
     this.wipe = Math.max(0, Math.min(1, share));
     this.part.wipe.style.left = `${100 * this.wipe}%`;
     this.part.wipe.setAttribute("aria-valuenow", Math.round(100 * this.wipe));
@@ -121,7 +140,7 @@ class Flight {
     this.at = index;
     this.camera.goTo(this.data.views[index], this.data.up);
     this.camera.fov = this.fitted(index);
-    if (this.over) this.camera.turnOver();
+    for (const up of this.ups.slice(1, this.upright + 1)) this.camera.stand(up, this.data.drag === "orbit");
   }
 
   // The field of view along the longer side of the stage, in which all of a view's picture is seen.
@@ -132,11 +151,20 @@ class Flight {
     return 2 * Math.atan(height * Math.max(1, wide));
   }
 
-  // Which way is up was estimated, and may be wrong.
-  turnOver() {
-    this.over = !this.over;
-    this.camera.turnOver();
+  // Turn the scene by a quarter: which way is up was estimated, and may be wrong.
+  turnUp() {
+    this.upright = (this.upright + 1) % this.ups.length;
+    this.camera.stand(this.ups[this.upright], this.data.drag === "orbit");
+    this.sayUp();
     this.change();
+  }
+
+  sayUp() {
+    const up = this.ups[this.upright], name = NAMES[AXES.findIndex((axis) => dot(axis, up) > ALONG)];
+    const text = name ? name.padStart(2, "+") : up.map((value) => value.toFixed(2)).join(" ");
+    this.part.up.textContent = `up: ${text}${this.upright || this.data.sure ? "" : ", a guess"}`;
+    this.part.option.textContent = `--up=${name}`;
+    this.part.option.parentElement.hidden = !name;
   }
 
   reset() {
@@ -159,9 +187,13 @@ class Flight {
     this.change();
   }
 
+  get seenFrom() {
+    return { ...this.camera.state, near: this.data.near };
+  }
+
   // The camera is another one: sort anew, and count frames until it stands still.
   change() {
-    for (const { sorting } of this.scenes) sorting.sort({ ...this.camera.state, near: this.data.near });
+    for (const { sorting } of this.scenes) sorting.sort(this.seenFrom);
     clearTimeout(this.settling);
     this.settling = setTimeout(() => {
       this.settling = 0;
@@ -185,7 +217,7 @@ class Flight {
     const last = this.times.at(-1) ?? now;
     if (this.controls.step(Math.min(0.1, (now - last) / 1000))) this.change();
     this.paint();
-    if (!this.settling) return;
+    if (!this.settling || !this.drawer.gl) return;
     this.times = [...this.times, now].slice(-30);
     const [first, frames] = [this.times[0], this.times.length - 1];
     if (frames < 4) return;
@@ -199,6 +231,6 @@ class Flight {
 
   paint() {
     const [left, right] = this.scenes, parts = right ? [[left, 0, this.wipe], [right, this.wipe, 1]] : [[left, 0, 1]];
-    if (left) this.drawer.draw(this.camera, this.data, parts, this.settling ? this.detail : 1);
+    if (left) this.drawer.draw(this.camera, this.data, parts, this.settling ? this.detail : 1, Boolean(this.settling));
   }
 }

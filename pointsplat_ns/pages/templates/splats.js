@@ -206,6 +206,11 @@ class Sorting {
     this.next();
   }
 
+  end() {
+    this.onSorted = () => {};
+    this.worker?.terminate();
+  }
+
   sortHere() {
     this.worker = null;
     this.sorted = makeSorter(this.positions);
@@ -264,8 +269,14 @@ class Drawer {
       gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
       scene.shown = order.length;
     };
-    const scene = { texture, array, texels, degree, antialiased, shown: 0, setOrder };
+    const scene = { texture, array, indices, texels, degree, antialiased, shown: 0, setOrder };
     return scene;
+  }
+
+  remove({ texture, array, indices }) {
+    this.gl.deleteTexture(texture);
+    this.gl.deleteVertexArray(array);
+    this.gl.deleteBuffer(indices);
   }
 
   resize(width, height) {

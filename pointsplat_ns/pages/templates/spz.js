@@ -12,9 +12,10 @@ function bytesOfBase64(text) {
   return bytes;
 }
 
-async function unpackSpz(base64) {
-  const packed = new Blob([bytesOfBase64(base64)]).stream();
-  const buffer = await new Response(packed.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+// `packed` is an array of bytes, or their base64.
+async function unpackSpz(packed) {
+  const stream = new Blob([typeof packed === "string" ? bytesOfBase64(packed) : packed]).stream();
+  const buffer = await new Response(stream.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
   const head = new DataView(buffer);
   if (head.getUint32(0, true) !== 0x5053474e || head.getUint32(4, true) !== 3) throw new Error("not SPZ of version 3");
   const count = head.getUint32(8, true), degree = head.getUint8(12), step = 2 ** -head.getUint8(13);

@@ -17,8 +17,8 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import open_inside
 from pointsplat_ns.io.formats import STREAM_META
 from pointsplat_ns.io.formats.sog_stream import stream_parts
+from pointsplat_ns.pages.server import Answer, Route, Served, Server
 from pointsplat_ns.pages.stream_page import own_page, page_files
-from pointsplat_ns.viewing.server import Answer, Route, Served, Server
 
 logger = logging.getLogger("pointsplat_ns")
 

@@ -8,11 +8,15 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
+from making import ball
 from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
+from pointsplat_ns.looking.opening import Opening
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.viewing import camera_path
-from pointsplat_ns.viewing.camera_path import read_path
-from pointsplat_ns.viewing.trajectories import along, fitted, orbit, up_of, walk
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pages import camera_path
+from pointsplat_ns.pages.camera_path import FilmSettings, read_path
+from pointsplat_ns.pages.trajectories import along, fitted, toured, walk
 
 
 def views_at(eyes: torch.Tensor, targets: torch.Tensor, up: torch.Tensor | None = None) -> ps.Views:
@@ -64,19 +68,9 @@ def test_path_goes_exactly_through_every_pose(frames):
     assert_rigid(path)
 
 
-@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
-def test_up_is_that_of_cameras_that_were_held_level(up):
-    up = torch.tensor(up, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(1)
-    eyes = torch.randn(20, 3, generator=generator, dtype=torch.float64)
-    level = torch.randn(20, 3, generator=generator, dtype=torch.float64)
-    targets = eyes + level - (level @ up)[:, None] * up - 0.2 * up
-    torch.testing.assert_close(up_of(views_at(eyes, targets, up)), up, rtol=0, atol=1e-6)
-
-
 def test_walk_never_leans_and_passes_the_views():
     views = ring(torch.tensor([0.0, 2.0, 0.7, 1.4, 2.6]))
-    path = walk(views, 101)
+    path = walk(toured(views), 101, torch.tensor([0.0, 0.0, 1.0]).double())
     assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9, "what is right in the picture is level"
     for viewmat in views.viewmats:
         assert float((path.viewmats - viewmat).abs().amax((1, 2)).min()) < 1e-9
@@ -85,27 +79,17 @@ def test_walk_never_leans_and_passes_the_views():
     assert_rigid(path)
 
 
-def test_orbit_goes_all_around_what_is_looked_at():
-    views = ring(torch.arange(0, 6.2, 0.7))
-    path = orbit(views, 36, torch.tensor([9.0, 9.0, 9.0]))
-    apart = places(path) - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
-    # The content's centre draws the middle a little to itself.
-    assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.6).all())
-    steps = torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff()
-    assert float(steps.max()) < 1.6 * 2 * math.pi / 36
-    assert bool(((axes(path, 2) * apart).sum(1) < 0).all())
-    assert_rigid(path)
-
-
-def test_orbit_in_a_room_is_a_turn_on_the_spot():
-    angles = torch.arange(0, 6.2, 0.7, dtype=torch.float64)
-    outward = torch.stack([angles.cos(), angles.sin(), 0 * angles - 0.1], dim=1)
-    views = views_at(0.5 * outward, 2 * outward)
-    path = orbit(views, 24, torch.zeros(3))
-    assert float(places(path).std(0).max()) < 1e-9
-    ahead = axes(path, 2)
-    yaw = torch.atan2(ahead[:, 1], ahead[:, 0]).sort().values
-    torch.testing.assert_close(yaw.diff(), torch.full((23,), 2 * math.pi / 24).double(), rtol=0, atol=1e-6)
+def test_film_of_an_object_goes_once_around_it(monkeypatch):
+    up, turn = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 2 * math.pi / 12
+    opening = Opening(ring(turn * torch.arange(12)), Up(up), whole=True)
+    monkeypatch.setattr(camera_path, "opening_views", lambda *_: opening)
+    scene = ball(20)
+    path = camera_path.camera_path(scene, ViewSource(scene), None, FilmSettings(64, 48, fps=10, seconds=3.7)).views
+    torch.testing.assert_close(path.viewmats[0], path.viewmats[-1], rtol=0, atol=1e-9)
+    apart = places(path)[:-1] - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+    assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.15).all())
+    assert float(torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff().max()) < 1.6 * 2 * math.pi / 36
+    assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9 and bool(((axes(path, 2)[:-1] * apart).sum(1) < 0).all())
 
 
 def test_another_size_shows_as_much_from_top_to_bottom():
@@ -116,7 +100,7 @@ def test_another_size_shows_as_much_from_top_to_bottom():
     assert torch.equal(fitted(views, 64, 48).Ks, views.Ks)
 
 
-@pytest.mark.parametrize("path", [along, walk, lambda *a: orbit(*a, torch.zeros(3))])
+@pytest.mark.parametrize("path", [along, lambda *of: walk(*of, torch.tensor([0.0, 0.0, 1.0]))])
 def test_no_views_or_frames_are_refused(path):
     with pytest.raises(ps.DataError, match="expected at least one"):
         path(captured()[:0], 5)

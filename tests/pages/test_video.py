@@ -8,9 +8,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud, decoded
-from pointsplat_ns.viewing import video
-from pointsplat_ns.viewing.film import Wipe, with_labels
-from pointsplat_ns.viewing.video import write_frames
+from pointsplat_ns.pages import video
+from pointsplat_ns.pages.film import Wipe, with_labels
+from pointsplat_ns.pages.video import write_frames
 
 
 def drawn(count: int = 6, width: int = 128, height: int = 96) -> list[np.ndarray]:

@@ -20,12 +20,11 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.camera_files.cameras import finite
 from pointsplat_ns.io.files import logger, one_line, require_file
-from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pages.trajectories import along, fitted, toured, walk
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
-from pointsplat_ns.viewing.trajectories import along, fitted, orbit, walk
 from pointsplat_ns.views import Views
 
 
@@ -89,63 +88,51 @@ class CameraPath:
 def camera_path(
     scene: Gaussians,
     source: ViewSource,
-    path: str | Path,
+    saved: str | Path | None,
     settings: FilmSettings,
     one: bool = False,
     up: Up | None = None,
 ) -> CameraPath:
-    """Choose the cameras of a film of a scene.
+    """Choose the cameras of a film of a scene: a saved path, else exactly through known views, else past sampled ones,
+    which go around an object and through a room.
 
     Args:
         scene: N Gaussians.
         source: source of views.
-        path: "dataset" goes exactly through the poses of the run's dataset, "walk" past some views and "orbit" about
-            their common content; "auto" is "dataset" if there is one, else "walk". Any other text is the path of a file
-            that nerfstudio's viewer saved.
+        saved: the path of a file that nerfstudio's viewer saved.
         settings: size, speed and length.
-        one: return one camera only: the one that shows most, unless the path says which.
-        up: which way is up, for a walk or an orbit; by default what the scene declares, that of known views, or
-            estimated.
+        one: return one camera only: the first of a saved path, else the one that shows most.
+        up: which way is up; by default what the scene declares, that of known views, or estimated.
 
     Raises:
         DataError: if there are no views, or the file is not a camera path.
         SceneError: if there is no such file.
     """
     up = known_up(up, scene)
-    if str(path) not in ("auto", "dataset", "walk", "orbit"):
-        saved = read_path(path)
-        fps = settings.fps or saved.fps or CAMERA_PATH.fps
-        frames = 1 if one else len(saved.views) if settings.seconds is None else _frames(settings.seconds, fps)
-        known = source.known(1)
-        views = _sized(saved.views, settings, (saved.views.width, saved.views.height))
+    known = source.known(CAMERA_PATH.frames)
+    if saved is not None:
+        path = read_path(saved)
+        fps = settings.fps or path.fps or CAMERA_PATH.fps
+        frames = 1 if one else len(path.views) if settings.seconds is None else _frames(settings.seconds, fps)
+        views = _sized(path.views, settings, (path.views.width, path.views.height))
         if known is not None:
             views = dataclasses.replace(views, background=known.background, rasterize_mode=known.rasterize_mode)
-        return CameraPath(views if frames == len(views) else along(views, frames), fps, f"the path of {path}")
-    known = source.known(CAMERA_PATH.frames)
-    if path == "dataset" and known is None:
-        raise DataError(f"no poses of a dataset{source.missing}; expected a run whose photos are found, or views")
+        return CameraPath(views if frames == len(views) else along(views, frames), fps, f"the path of {saved}")
     fps = settings.fps or CAMERA_PATH.fps
     frames = 1 if one else _frames(10.0 if settings.seconds is None else settings.seconds, fps)
-    if known is not None and path in ("auto", "dataset"):
-        if settings.seconds is None and not one:
-            frames = max(frames, len(known))
-        usual = (known.width, known.height) if source.given is not None else _reduced(known)
-        if one and path == "auto":
-            known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
-        views = along(_sized(known, settings, usual), frames)
-        skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
-        return CameraPath(views, fps, f"along the {source.origin}{skipped}")
     if known is None:
         opening = opening_views(scene, 1 if one else VIEW_COUNTS.walked, *_shape(settings, (960, 540)), up)
-        stops = opening.views
-        up, origin = opening.up, f"views that show most, up is {opening.up}{source.missing}"
-    else:
-        stops, origin = _sized(known.spread(2 * VIEW_COUNTS.walked), settings, _reduced(known)), source.origin
-    upward = None if up is None else up.direction
-    if path == "orbit":
-        low, high = content_box(scene)
-        return CameraPath(orbit(stops, frames, 0.5 * (low + high).cpu(), upward), fps, f"a turn, by {origin}")
-    return CameraPath(walk(stops, frames, upward, from_first=known is None), fps, f"a walk past {origin}")
+        stops = opening.views[[*range(len(opening.views)), 0]] if opening.whole else toured(opening.views)
+        origin = f"{'around' if opening.whole else 'past'} what shows most, up is {opening.up}{source.missing}"
+        return CameraPath(walk(stops, frames, opening.up.direction), fps, origin)
+    if settings.seconds is None and not one:
+        frames = max(frames, len(known))
+    usual = (known.width, known.height) if source.given is not None else _reduced(known)
+    if one:
+        known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
+    views = along(_sized(known, settings, usual), frames)
+    skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
+    return CameraPath(views, fps, f"along the {source.origin}{skipped}")
 
 
 def _frames(seconds: float, fps: float) -> int:

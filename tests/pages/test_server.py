@@ -2,6 +2,7 @@
 
 import html
 import json
+import math
 import socket
 import struct
 import threading
@@ -18,10 +19,10 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns.viewing import server
-from pointsplat_ns.viewing import viewer as viewing
-from pointsplat_ns.viewing.server import LOCAL, refusal
-from pointsplat_ns.viewing.viewer import Viewer
+from pointsplat_ns.pages import kept, server
+from pointsplat_ns.pages import viewer as viewing
+from pointsplat_ns.pages.server import LOCAL, refusal
+from pointsplat_ns.pages.viewer import Viewer
 from serving import answer
 
 CLIENT = "a page of the tests"
@@ -45,25 +46,21 @@ def post(viewer: Viewer, path: str, body: bytes, **headers: str):
 
 
 def said(viewer: Viewer, path: str, **values: Any):
-    return post(viewer, path, json.dumps({"client": CLIENT, "stage": 1, **values}).encode())
+    return post(viewer, path, json.dumps({"stage": 1, **values}).encode())
 
 
 def looked(**changes: Any) -> dict[str, Any]:
-    """What a page says of its camera, which is 20 units in front of the content."""
+    """What a page that cannot draw says of its camera, which is 20 units in front of the content."""
     camera = {"eye": [0, -20, 0], "right": [1, 0, 0], "down": [0, 0, -1], "ahead": [0, 1, 0], "fov": 0.8}
-    return {"camera": camera, "width": 64, "height": 48, "wipe": 0.5, "kept": [100], "look": 1, **changes}
+    asked = {"camera": camera, "width": 64, "height": 48, "wipe": 0.5, "kept": [100], "quick": False, "look": 1}
+    return {"client": CLIENT, **asked, **changes}
 
 
-def whole_picture(viewer: Viewer, look: int, **values: Any) -> tuple[np.ndarray, dict[str, Any]]:
-    """The full picture of a look, and what is said with it."""
-    number = texts = 0
-    for _ in range(30):
-        status, body, headers = said(viewer, "/picture", number=number, texts=texts, **values)
-        state = json.loads(headers["X-State"])
-        if status == 200 and state["look"] == look:
-            return np.asarray(Image.open(BytesIO(body))), state
-        number, texts = state["number"], state["texts"]
-    pytest.fail("no full picture")
+def scene_at(viewer: Viewer, percent: int, have: str = "", **values: Any) -> tuple[int, bytes, dict[str, Any]]:
+    """The answer to a page that asks for its only scene at a share."""
+    asked = {"scene": 0, "percent": percent, "have": have, "spz": True}
+    status, body, headers = said(viewer, "/scene", **{**asked, **values})
+    return status, body, json.loads(headers["X-State"])
 
 
 def test_page_is_served_and_asks_nobody_else(viewer):
@@ -110,7 +107,7 @@ def test_a_connection_is_closed_as_its_client_asks(request_line, viewer):
 
 
 @pytest.mark.parametrize(
-    "said", ["", "GET / HT", "POST /look HTTP/1.1\r\nOrigin: {0}\r\nHost: {1}\r\nContent-Length: 9"]
+    "said", ["", "GET / HT", "POST /scene HTTP/1.1\r\nOrigin: {0}\r\nHost: {1}\r\nContent-Length: 9"]
 )
 def test_clients_that_send_half_a_request_stop_nobody(said, empty, monkeypatch):
     """Nor one whose request is being answered meanwhile, here for as long as we want."""
@@ -138,7 +135,7 @@ def test_clients_that_send_half_a_request_stop_nobody(said, empty, monkeypatch):
 
 
 def test_pages_elsewhere_move_no_camera_and_drop_no_scene(viewer, empty):
-    for opened, path in ((viewer, "/look"), (viewer, "/picture"), (empty, "/drop?name=a.ply")):
+    for opened, path in ((viewer, "/scene"), (viewer, "/picture"), (empty, "/drop?name=a.ply")):
         for origin in ({"Origin": "http://evil.example"}, {}):
             assert answer(opened, "POST", path, b"{}", **origin)[0] == 403
         assert answer(opened, "GET", path)[0] == 405
@@ -147,21 +144,65 @@ def test_pages_elsewhere_move_no_camera_and_drop_no_scene(viewer, empty):
 @pytest.mark.parametrize(
     "body",
     [
-        b"", b"[]", b"{", b"\xff", json.dumps({"client": CLIENT}).encode(),
-        *(
-            json.dumps({"client": CLIENT, "stage": 1, **looked(**changes)}).encode()
+        b"", b"[]", b"{", b"\xff", json.dumps({"client": CLIENT}).encode(), *(
+            json.dumps({"stage": 1, **looked(**changes)}).encode()
             for changes in (
                 {"camera": {}}, {"client": "x"}, {"client": "x" * 99}, {"kept": []}, {"width": "wide"}, {"look": None},
-                {"camera": {**looked()["camera"], "eye": [0, 0]}}, {"wipe": []},
-                {"camera": {**looked()["camera"], "eye": [0, 0, float("nan")]}},
+                {"camera": {**looked()["camera"], "eye": [0, 0]}}, {"wipe": []}, {"width": math.inf},
+                {"camera": {**looked()["camera"], "eye": [0, 0, float("nan")]}}, {"kept": [math.nan]},
                 {"camera": {**looked()["camera"], "right": [0, 1, 0]}},
             )
         ),
     ],
 )  # fmt: skip
 def test_what_no_page_sends_is_refused_and_harms_nothing(body, viewer):
-    assert post(viewer, "/look", body)[0] == 400
-    assert said(viewer, "/look", **looked(look=9))[0] == 204
+    assert post(viewer, "/picture", body)[0] == 400
+    assert said(viewer, "/picture", **looked(look=9))[0] == 200
+
+
+@pytest.mark.parametrize("changes", [{"scene": 1}, {"scene": -1}, {"percent": "x"}, {"percent": math.inf}])
+def test_scenes_that_are_not_there_are_refused(changes, viewer):
+    asked = {"scene": 0, "percent": 50, "have": "", "spz": True, **changes}
+    assert said(viewer, "/scene", **asked)[0] == 400
+    assert said(viewer, "/scene", **{**asked, "stage": 2})[0] == 409
+
+
+def test_pictures_for_browsers_that_cannot_draw_are_renders(viewer):
+    status, body, headers = said(viewer, "/picture", **looked(width=320, height=240))
+    shown = np.asarray(Image.open(BytesIO(body))).astype(float)
+    assert (status, headers["Content-Type"], shown.shape) == (200, "image/jpeg", (240, 320, 3))
+    stage = viewer._stage
+    drawn = 255 * ps.render(ball(300), stage.view(looked(width=320, height=240))).numpy()
+    assert np.square(shown - drawn).mean() < 20, "JPEG"
+    quick = np.asarray(Image.open(BytesIO(said(viewer, "/picture", **looked(quick=True))[1])))
+    assert quick.shape == (48, 64, 3) and quick.std() > 10
+    assert stage.picture(looked(), outdated=lambda: True) == b""
+
+
+def test_a_moved_camera_ends_its_own_picture_and_no_other(viewer, monkeypatch):
+    waiting, ended = threading.Event(), []
+
+    def slow(wanted, outdated):
+        waiting.set()
+        while not outdated():
+            time.sleep(0.01)
+        ended.append(wanted["look"])
+        return b""
+
+    with monkeypatch.context() as patch:
+        patch.setattr(viewer._stage, "picture", slow)
+        first = threading.Thread(target=said, args=(viewer, "/picture"), kwargs=looked(look=5))
+        first.start()
+        assert waiting.wait(20)
+        patch.setattr(viewer._stage, "picture", lambda wanted, outdated: b"jpeg")
+        other = threading.Thread(target=said, args=(viewer, "/picture"), kwargs=looked(client="another page 1234"))
+        other.start()
+        time.sleep(0.1)
+        assert not ended
+        assert said(viewer, "/picture", **looked(look=6))[1] == b"jpeg"
+    first.join()
+    other.join()
+    assert ended == [5]
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
@@ -171,8 +212,10 @@ def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     name = quote(f"my ball{suffix}")
     assert post(empty, f"/drop?name={name}", (tmp_path / f"a{suffix}").read_bytes())[:2] == (204, b"")
     assert f"<strong>my ball{suffix}</strong>".encode() in answer(empty, "GET", "/")[1]
-    assert said(empty, "/look", **looked())[0] == 204
-    assert whole_picture(empty, 1)[0].std() > 10
+    status, body, state = scene_at(empty, 100)
+    (tmp_path / "shown.spz").write_bytes(body)
+    assert status == 200 and len(ps.load(tmp_path / "shown.spz")) == 300
+    assert state == {"amount": "300 Gaussians", "command": "", "how": "all", "whole": True}
 
 
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nproperty float x\nend_header\n"
@@ -226,43 +269,50 @@ def test_places_that_cannot_be_listened_on_are_refused_in_one_line(host, port):
     assert "\n" not in str(raised.value)
 
 
-def test_closing_twice_frees_the_port_and_ends_waiting_pages(tmp_path):
+def test_closing_twice_frees_the_port_and_ends_waiting_pages(monkeypatch):
+    monkeypatch.setattr(viewing, "VIEWER", viewing.ViewerSettings(wait_seconds=20.0))
+    begun = threading.Event()
+    monkeypatch.setattr(kept.Levels, "_work", lambda levels: begun.wait())  # never merges
     viewer = ps.open_viewer(ball(300), port=0)
-    waiting = threading.Thread(target=said, args=(viewer, "/picture"), kwargs={"number": 0, "texts": 0})
+    waiting = threading.Thread(target=scene_at, args=(viewer, 50, "chosen by coverage"))
     waiting.start()
-    while not viewer._watchers:
+    while viewer._stage.levels[0]._wanted is None:
         time.sleep(0.01)
+    begun.set()
     viewer.close()
     viewer.close()
-    waiting.join(5.0)  # s; a page would wait for VIEWER.wait_seconds
-    assert viewing.VIEWER.wait_seconds > 5.0 and not waiting.is_alive()
+    waiting.join(5.0)  # s; a page would wait for 20
+    assert not waiting.is_alive()
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", int(viewer.url.rpartition(":")[2])))
 
 
-def test_kept_share_is_shown_at_once_then_merged_with_its_command(tmp_path):
+def test_kept_share_comes_at_once_then_merged_with_its_command(tmp_path):
     path = Path(tmp_path / "a room.ply")
     ps.save(ps.example_room()[::20], path)
     with ps.open_viewer(path, port=0) as viewer:
-        assert said(viewer, "/look", **looked(kept=[20]))[0] == 204
-        _, state = whole_picture(viewer, 1)
-        assert state["scenes"][0]["amount"].startswith("629 of 3,143 Gaussians, ")
-        assert state["scenes"][0]["command"] == f"pointsplat prune '{path}' --keep 20%"
-        end = time.monotonic() + 60
-        while "merged" not in state["scenes"][0]["amount"] and time.monotonic() < end:
-            state = json.loads(said(viewer, "/picture", number=0, texts=state["texts"])[2]["X-State"])
-        assert state["scenes"][0]["amount"] == "629 of 3,143 Gaussians, merged"
+        status, first, state = scene_at(viewer, 20)
+        assert state["amount"] == "629 of 3,143 Gaussians, chosen by coverage" and not state["whole"]
+        assert status == 200 and state["command"] == f"pointsplat prune '{path}' --keep 20%"
+        assert scene_at(viewer, 20, spz=False)[:2] == (204, b"")
+        end, how = time.monotonic() + 60, state["how"]
+        body = first
+        while body in (first, b""):
+            assert time.monotonic() < end
+            status, body, state = scene_at(viewer, 20, how)
+        assert state["amount"] == "629 of 3,143 Gaussians, merged" and state["whole"]
+        assert scene_at(viewer, 20, "merged")[0] == 204
 
 
 def test_bodies_have_a_size_that_is_said_and_not_too_large(viewer):
-    assert post(viewer, "/look", b"x" * 70_000)[0] == 413
-    assert answer(viewer, "POST", "/look", None, Origin=viewer.url)[0] == 411
-    assert post(viewer, "/look", b"x", Content_Length="-1")[0] == 411
-    assert post(viewer, "/look", b"x", Transfer_Encoding="chunked")[0] == 411
+    assert post(viewer, "/picture", b"x" * 70_000)[0] == 413
+    assert answer(viewer, "POST", "/picture", None, Origin=viewer.url)[0] == 411
+    assert post(viewer, "/picture", b"x", Content_Length="-1")[0] == 411
+    assert post(viewer, "/picture", b"x", Transfer_Encoding="chunked")[0] == 411
 
 
-@pytest.mark.parametrize("path", ["/../__init__.py", "/drop", "/other", "/etc/passwd", "/%2e%2e/x", "/?/../../x"])
+@pytest.mark.parametrize("path", ["/../__init__.py", "/drop", "/spz.js", "/etc/passwd", "/%2e%2e/x", "/?/../../x"])
 def test_only_the_routes_are_served(path, viewer):
     status, body, _ = answer(viewer, "GET", path)
     assert status == (200 if path.startswith("/?") else 404) and b"root:" not in body

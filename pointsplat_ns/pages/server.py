@@ -271,7 +271,7 @@ class _Handler(BaseHTTPRequestHandler):
         body = _Body(self.rfile, int(length), lambda: server.waits(self.connection, False))
         try:
             answer = route.answer(Request(options, int(length), cast(BinaryIO, body)))
-        except (ValueError, TypeError, KeyError):  # a body that no page of this server sends
+        except (ValueError, TypeError, KeyError, OverflowError):  # a body that no page of this server sends
             answer = Answer(status=http.HTTPStatus.BAD_REQUEST)
         self.close_connection = body.left > 0
         return answer

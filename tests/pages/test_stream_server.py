@@ -20,9 +20,9 @@ from pointsplat_ns.io.files import open_inside
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.pages.stream_page import stream_page
+from pointsplat_ns.pages.stream_server import PageServer
+from pointsplat_ns.pages.viewer import Viewer
 from pointsplat_ns.pages.web_viewer import KNOWN_FILES, WebViewerPackage, cache_folder, web_viewer
-from pointsplat_ns.viewing.page_server import PageServer
-from pointsplat_ns.viewing.viewer import Viewer
 from serving import answer
 from web_viewers import read_page, small_viewer, tarball
 

@@ -1,0 +1,289 @@
+"""The viewer: a page that draws a scene in the browser. It asks this server for the scene at other shares of its
+Gaussians, and for pictures if the browser cannot draw."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import shlex
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.looking.content import UNITS
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.pages.film import Wipe, to_uint8, with_line
+from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
+from pointsplat_ns.pages.html import page
+from pointsplat_ns.pages.kept import Level, Levels
+from pointsplat_ns.pages.server import READABLE_NAMES, Answer, Request, Route, Served, Server, received
+from pointsplat_ns.system.memory import share_freed_memory
+from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.views import View
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """Limits of the viewer."""
+
+    most_pages: int = 8
+    """Largest number of pages that get pictures; the one that asked least recently gives way."""
+    wait_seconds: float = 2.0
+    """Longest wait of a page's request for a merged scene; then the page asks again."""
+    end_seconds: float = 5.0
+    """Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
+    largest_side: int = 4096
+    """Largest longer side of a picture, pixels."""
+    largest_file: int = 4_000_000_000
+    """Largest file that may be dropped, bytes."""
+
+
+VIEWER = ViewerSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class ViewedScene:
+    """A scene for the viewer."""
+
+    name: str
+    path: Path | None
+    """Path of the scene; None if it has none."""
+    scene: Gaussians
+    source: ViewSource
+    """Source of views."""
+    levels: Sequence[Gaussians] = ()
+    """Smaller scenes that are there already, as of :class:`~pointsplat_ns.pages.kept.Levels`."""
+
+
+class _Stage:
+    """The scenes that are shown, from where, and at which shares."""
+
+    def __init__(self, scenes: Sequence[ViewedScene], up: Up | None, number: int, drops: bool):
+        self.scenes, self.number = scenes, number
+        first = scenes[0]
+        known = first.source.known(VIEW_COUNTS.opening)
+        self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
+        found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
+        self.origin = found if known is None else first.source.origin
+        self.levels = [Levels(viewed.scene, viewed.source, viewed.levels) for viewed in scenes]
+        shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]
+        if len(scenes) == 1:
+            shown.append({"name": "all of it", "amount": ""})
+        data = {**self.frame.data(shown), "stage": number, "kept": [100] * len(scenes)}
+        self.html = _live_page(" and ".join(viewed.name for viewed in scenes), data, drops)
+
+    def state(self, index: int, percent: int, level: Level, whole: bool) -> dict[str, Any]:
+        """What a page says of a level, with the command that makes it; ``whole`` if no better one comes."""
+        viewed, levels, command = self.scenes[index], self.levels[index], ""
+        amount = f"{len(levels.scene):,} Gaussians"
+        if percent < 100:
+            how = level.how if whole else levels.status or level.how
+            amount = f"{len(level.scene):,} of {amount}, {how}"
+            if viewed.path is not None:
+                command = shlex.join(["pointsplat", "prune", str(viewed.path), "--keep", f"{percent}%"])
+        return {"amount": amount, "command": command, "how": level.how, "whole": whole}
+
+    def view(self, wanted: dict[str, Any]) -> View:
+        """The view that a page asks for. Errors are those of Python if it is not what the page of this server sends."""
+        camera, views = wanted["camera"], self.frame.views
+        width, height = (min(max(int(wanted[name]), 1), VIEWER.largest_side) for name in ("width", "height"))
+        eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
+        turn, unit = torch.stack([right, down, ahead]), self.frame.size / UNITS
+        if not bool(((turn @ turn.T - torch.eye(3, **DOUBLES)).abs() < 1e-3).all()):
+            raise ValueError("no rotation")
+        viewmat = torch.eye(4, **DOUBLES)
+        viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ (eye * unit + self.frame.centre)
+        focal = 0.5 * max(width, height) / math.tan(0.5 * min(max(float(camera["fov"]), 0.01), 3.1))
+        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], **DOUBLES)
+        return View(viewmat, K, width, height, views.background, views.rasterize_mode, views.near_plane * unit)
+
+    @torch.no_grad()
+    def picture(self, wanted: dict[str, Any], outdated: Callable[[], bool]) -> bytes:
+        """The picture that a page asks for, as JPEG; empty once it is outdated. A quick one is drawn with fewer
+        Gaussians. Errors as of :meth:`view`."""
+        from PIL import Image
+
+        view, quick = self.view(wanted), bool(wanted["quick"])
+        kept = [levels.at(_percent(share)) for levels, share in zip(self.levels, wanted["kept"], strict=True)]
+        if len(kept) == 1 and kept[0] is not self.levels[0].whole:
+            kept.append(self.levels[0].whole)
+        first, *others = [level.light if quick else level.scene for level in kept]
+        column = round(min(max(float(wanted["wipe"]), 0.0), 1.0) * view.width)
+        drawing = Wipe(first, others[0] if others else None, view, column, "fast" if quick else "exact")
+        # At least 32,768 pixels between two checks for a moved camera.
+        bands, rows = [], max(32_768 // (8 * view.width), 1)
+        for top in range(0, drawing.rows, rows):
+            if outdated():
+                return b""
+            bands.append(drawing.draw(top, min(top + rows, drawing.rows)))
+        pixels, stream = to_uint8(torch.cat(bands)), io.BytesIO()
+        shown = with_line(pixels, drawing.column) if others else pixels
+        Image.fromarray(shown).save(stream, format="JPEG", quality=75 if quick else 95)
+        return stream.getvalue()
+
+    def close(self, timeout: float) -> None:
+        """Stop merging, and wait for it at most ``timeout`` seconds."""
+        for levels in self.levels:
+            levels.close(timeout)
+
+
+class Viewer(Served):
+    """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
+    ``with`` block.
+
+    Without scenes, a page takes a dropped file, which ``read`` reads with its name. ``port`` is the first to try; 0
+    takes any free port. By default up is that of the first scene's known views, or estimated. Raises SceneError if no
+    Gaussian of a scene can be drawn, DataError if none of the first scene is visible, and PointSplatError if no port is
+    free.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[ViewedScene],
+        host: str,
+        port: int,
+        up: Up | None = None,
+        read: Callable[[Path, str], ViewedScene] | None = None,
+    ):
+        share_freed_memory()  # each request has a thread
+        self._up, self._read = up, read
+        self._looks: dict[str, int] = {}
+        """Number of each page's newest picture; the page that asked last is the last."""
+        self._drawing, self._encoding, self._dropping = threading.Lock(), threading.Lock(), threading.Lock()
+        self._stage: _Stage | None = None
+        routes = {
+            "/": Route(self._page),
+            "/scene": Route(self._of_stage(self._scene), 1_024),
+            "/picture": Route(self._of_stage(self._picture), 65_536),
+        }
+        if read is not None:
+            routes["/drop"] = Route(self._drop, VIEWER.largest_file)
+        if scenes:
+            self._show(scenes)
+        self._server = Server(host, port, routes)
+        self.url = self._server.url
+
+    @property
+    def origin(self) -> str:
+        """Text on the origin of the first view; empty without a scene."""
+        return "" if self._stage is None else self._stage.origin
+
+    def close(self) -> None:
+        """End the server and all drawing. A second call does nothing."""
+        if self._server.fileno() < 0:
+            return
+        self._server.close()
+        self._looks.clear()
+        # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
+        for lock in (self._drawing, self._encoding, self._dropping):
+            lock.acquire(timeout=VIEWER.end_seconds)
+        if self._stage is not None:
+            self._stage.close(VIEWER.end_seconds)
+
+    def _show(self, scenes: Sequence[ViewedScene]) -> None:
+        number = 1 if self._stage is None else self._stage.number + 1
+        before, self._stage = self._stage, _Stage(scenes, self._up, number, self._read is not None)
+        if before is not None:
+            before.close(0.0)
+
+    def _page(self, request: Request) -> Answer:
+        html = _live_page("Open a scene", None, True) if self._stage is None else self._stage.html
+        return Answer(html, "text/html; charset=utf-8")
+
+    def _of_stage(self, answer: Callable[[_Stage, dict[str, Any]], Answer]) -> Callable[[Request], Answer]:
+        """A route for pages of the scenes that are shown; others are told to load again."""
+
+        def answered(request: Request) -> Answer:
+            wanted, stage = json.loads(request.body.read(request.length)), self._stage
+            if stage is None or wanted["stage"] != stage.number:
+                return Answer(status=HTTPStatus.CONFLICT)
+            return answer(stage, wanted)
+
+        return answered
+
+    def _scene(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
+        """A scene at a share, as SPZ if the page draws. A page that has one waits for a better one."""
+        index, percent, have = int(wanted["scene"]), _percent(wanted["percent"]), str(wanted["have"])
+        levels = dict(enumerate(stage.levels))[index]
+        if not have:
+            levels.stop(percent)
+        level = (levels.merged(percent, VIEWER.wait_seconds) if have else None) or levels.at(percent)
+        whole = levels.ready(percent) is level
+        headers = {"X-State": json.dumps(stage.state(index, percent, level, whole))}
+        if level.how == have or not wanted["spz"]:
+            return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
+        with self._encoding:
+            # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
+            level.spz = level.spz or stage.frame.encoded(level.scene, stage.scenes[index].name, level=1)
+        return Answer(level.spz, "application/octet-stream", headers=headers)
+
+    def _picture(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
+        """What a page's camera sees, for browsers that cannot draw; nothing if the camera has moved meanwhile."""
+        client, look = str(wanted["client"]), int(wanted["look"])
+        if not 16 <= len(client) <= 64:
+            raise ValueError("no name of a page")
+        self._looks.pop(client, None)
+        self._looks[client] = look
+        while len(self._looks) > VIEWER.most_pages:
+            self._looks.pop(next(iter(self._looks)), None)
+        with self._drawing:
+            try:
+                jpeg = stage.picture(wanted, lambda: self._looks.get(client) != look)
+            except RuntimeError as error:  # too little memory
+                logger.warning("cannot draw: %s", one_line(error))
+                return Answer(status=HTTPStatus.INTERNAL_SERVER_ERROR)
+        return Answer(jpeg, "image/jpeg") if jpeg else Answer(status=HTTPStatus.NO_CONTENT)
+
+    def _drop(self, request: Request) -> Answer:
+        """Take a dropped file, and show its scene."""
+        assert self._read is not None
+        with self._dropping, tempfile.TemporaryDirectory(prefix="pointsplat-drop-") as folder:
+            try:
+                path, name = received(request, Path(folder))
+                try:
+                    self._show([self._read(path, name)])
+                except PointSplatError as error:
+                    return _refused(str(error).replace(str(path), name))
+            except PointSplatError as error:
+                return _refused(str(error))
+            except (OSError, MemoryError) as error:
+                return _refused(f"the file cannot be read here ({one_line(error)})")
+        return Answer(status=HTTPStatus.NO_CONTENT)
+
+
+def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
+    """The page, with scenes that it asks this server for; without a flight it only takes a file."""
+    scripts = (*((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()), *(("drop.js",) if drops else ()))
+    text = page(
+        "scene.html", scripts, with_workers=True, connects=True, title=title, flight=flight, live=True,
+        drops=READABLE_NAMES if drops else (), notes=(), missing="", data={"flight": flight},
+    )  # fmt: skip
+    return text.encode("utf-8")
+
+
+def _percent(value: Any) -> int:
+    """A share of the Gaussians, 1 to 100 percent."""
+    return min(max(round(value), 1), 100)
+
+
+def _refused(text: str) -> Answer:
+    return Answer(text.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)
+
+
+def _vector(values: Any) -> torch.Tensor:
+    """A vector (3,) of finite numbers, float64."""
+    vector = torch.tensor([float(value) for value in values], **DOUBLES)
+    if vector.shape != (3,) or not bool(vector.isfinite().all()):
+        raise ValueError("no vector")
+    return vector

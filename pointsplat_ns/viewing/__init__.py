@@ -1,1 +1,0 @@
-"""Views of scenes: camera paths, split-screen pictures, videos, and the viewer in a browser."""
