@@ -81,8 +81,8 @@ def test_a_camera_is_on_the_cpu_in_float64_whatever_the_scene_and_the_view_are(r
     for dtype in (torch.float32, torch.float64):
         view = dataclasses.replace(views[0], viewmat=views[0].viewmat.to(dtype), K=views[0].K.to(dtype))
         with pretend_gpu():
-            project_scene(room.to(GPU), view)
-            project_scene(room.to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
+            project_scene(room[:20].to(GPU), view)
+            project_scene(room[:20].to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
     assert len(given) == 4
     assert all((viewmat.device.type, viewmat.dtype) == ("cpu", torch.float64) for viewmat in given)
 

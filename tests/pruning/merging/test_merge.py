@@ -72,10 +72,10 @@ def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit_and_so_
 
 
 def test_without_a_compiler_the_same_gaussians_are_merged_but_for_rounding(monkeypatch):
-    scene = ball(2500)
-    compiled = merge(scene, 400)
+    scene, settings = ball(900), replace(RENDERED, sampled_views=4, finish_views=2)
+    compiled = merge(scene, 150, settings=settings)
     monkeypatch.setattr(Kernels, "usable", lambda kernels, wanted: False)
-    by_torch = merge(scene, 400)
+    by_torch = merge(scene, 150, settings=settings)
     into = [merged.scene.means[merged.assignment] for merged in (compiled, by_torch)]
     apart = (into[0] - into[1]).norm(dim=1)
     assert compiled.finish.psnr is not None and float((apart < 1e-4).float().mean()) > 0.95
