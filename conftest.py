@@ -3,54 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.rooms import light
-
-
-QUICK_LOOKING = {
-    "candidates_per_view": 2,
-    "min_candidates": 12,
-    "candidate_places": 150,
-    "evidence_count": 400,
-    "surface_points": 3072,
-    "upright_points": 1024,
-    "upright_directions": 200,
-}
-"""Settings of looking for tests of something else: views are sampled in a sixth of the time, and are a little worse."""
-
-USUAL_LOOKING = {name: getattr(LOOKING, name) for name in QUICK_LOOKING}
-
-
-@contextmanager
-def looking(values: dict[str, int]) -> Iterator[None]:
-    """Within, the default settings of looking have other values, also where they are a default argument."""
-    before = {name: getattr(LOOKING, name) for name in values}
-    try:
-        for name, value in values.items():
-            object.__setattr__(LOOKING, name, value)
-        yield
-    finally:
-        for name, value in before.items():
-            object.__setattr__(LOOKING, name, value)
+from quick_looking import QUICK, USUAL, looking
 
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_looking() -> Iterator[None]:
     """Views are chosen from few candidates, unless a test is about which are chosen."""
-    with looking(QUICK_LOOKING):
+    with looking(QUICK):
         yield
 
 
 @pytest.fixture(scope="module")
 def usual_looking() -> Iterator[None]:
     """The default settings of looking as they ship, for tests of what they are good for."""
-    with looking(USUAL_LOOKING):
+    with looking(USUAL):
         yield
 
 

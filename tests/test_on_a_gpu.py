@@ -7,12 +7,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import box_room, dense_config, fast_config, same
+from making import box_room, dense_config, fast_config, same, small_refiner
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system.threads import fixed_threads
 from pretend_gpu import GPU, pretend_gpu
 
@@ -127,9 +128,11 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, monkeypa
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
 
 
-def test_a_refiner_and_levels_of_detail_are_computed_on_a_gpu_from_one_thread(room, computed_there):
+def test_a_refiner_and_levels_are_computed_on_a_gpu_from_one_thread(room, computed_there, tmp_path):
+    save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
     with pretend_gpu() as gpu:
-        refined = ps.compact(room, 0.5, ps.load_refiner(), effort="instant", resolution=(64, 48))
+        refiner = ps.load_refiner(tmp_path / "small.safetensors")
+        refined = ps.compact(room, 0.5, refiner, effort="instant", resolution=(64, 48))
         levels = ps.lod(room.to(GPU), ["50%", "20%"], resolution=(64, 48))
         assert len(refined.scene) == 200 and [len(level.scene) for level in levels] == [200, 80]
     check(gpu)

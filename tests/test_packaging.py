@@ -45,24 +45,21 @@ def tracked_files() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The wheel of the tracked files, and that of their sdist."""
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the sdist of the tracked files."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
     for name in tracked_files():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
-    run(sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", out, cwd=source)
-    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", out, cwd=source)
-    [wheel], [sdist] = out.glob("*.whl"), out.glob("*.tar.gz")
-    offline = ("--quiet", "--no-deps", "--no-index", "--no-build-isolation")
-    run(sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", out / "again", sdist, cwd=out)
-    [again] = (out / "again").glob("*.whl")
-    return {"wheel": wheel, "sdist": again}
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", out, cwd=source)
+    assert len([*out.glob("*.tar.gz")]) == 1
+    [made] = out.glob("*.whl")
+    return made
 
 
 @dataclass(frozen=True)
 class Installed:
-    """A distribution in an environment of its own."""
+    """The package in an environment of its own."""
 
     environment: Path
     folder: Path  # with a small room.ply, to work in
@@ -76,10 +73,10 @@ class Installed:
         return self.environment / "bin" / "pointsplat"
 
 
-@pytest.fixture(scope="module", params=["wheel", "sdist"])
-def installed(request, wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The package, installed from the wheel or by way of the sdist."""
-    folder = tmp_path_factory.mktemp(request.param)
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The package, installed from the wheel."""
+    folder = tmp_path_factory.mktemp("installed")
     environment = folder / "environment"
     run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=folder)
     [packages] = (environment / "lib").glob("python*/site-packages")
@@ -87,30 +84,22 @@ def installed(request, wheels: dict[str, Path], tmp_path_factory: pytest.TempPat
     # package editably is one of those.
     (packages / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
     pip = (sys.executable, "-m", "pip", "--python", environment / "bin" / "python")
-    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheels[request.param], cwd=folder)
+    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     ps.save(ps.prune(ps.example_room(), GAUSSIANS, by="coverage"), folder / "room.ply")
     return Installed(environment, folder)
 
 
-def test_sdist_gives_the_same_wheel(wheels):
-    files = []
-    for path in wheels.values():
-        with zipfile.ZipFile(path) as archive:
-            files.append({entry.filename: entry.CRC for entry in archive.infolist()})
-    assert files[0] == files[1]
-
-
-def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheels):
+def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheel):
     packaged = [name for name in tracked_files() if name.startswith(("pointsplat_ns/", "method_configs/"))]
     wanted = {name for name in packaged if not name.endswith((".md", ".svg"))} | {CARD}
-    with zipfile.ZipFile(wheels["wheel"]) as archive:
+    with zipfile.ZipFile(wheel) as archive:
         held = {info.filename: info.file_size for info in archive.infolist()}
     assert len(wanted) > 100
     assert {name: held.get(name) for name in wanted} == {name: (ROOT / name).stat().st_size for name in wanted}
 
 
-def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheels):
-    with zipfile.ZipFile(wheels["wheel"]) as archive:
+def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheel):
+    with zipfile.ZipFile(wheel) as archive:
         [name] = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
         lines = archive.read(name).decode().splitlines()
     asked = [line.removeprefix("Requires-Dist: ") for line in lines if line.startswith("Requires-Dist: ")]
@@ -131,7 +120,6 @@ def test_installed_prune_makes_a_scene_small(installed):
     assert len(ps.load(installed.folder / "room_pruned.ply")) == GAUSSIANS // 10
 
 
-@pytest.mark.parametrize("installed", ["wheel"], indirect=True)  # that of the sdist is the same
 def test_installed_compact_finds_the_refiner_that_ships(installed):
     run(installed.pointsplat, "compact", "room.ply", "--keep", "20%", cwd=installed.folder)
     assert len(ps.load(installed.folder / "room_compact.ply")) == GAUSSIANS // 5

@@ -173,10 +173,6 @@ def test_a_parameter_that_is_missing_or_cannot_be_one_is_named(tmp_path, checkpo
     fails(tmp_path / "a.ckpt", fragment, name)
 
 
-def test_no_file_is_said(tmp_path):
-    fails(tmp_path / "none.ckpt", "no such file")
-
-
 def read(tmp_path, text):
     (tmp_path / "config.yml").write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_config(tmp_path / "config.yml")

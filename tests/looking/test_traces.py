@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import EYES, ball, box_room, normal_scene, photographed
+from making import EYES, ball, box_room, normal_scene, photographed, run_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
@@ -181,11 +181,6 @@ def test_views_are_sampled_where_photos_were_taken():
 @pytest.fixture(scope="module")
 def scene() -> Gaussians:
     return ball(400)
-
-
-def run_of(trained_walls: Path, name: str) -> Path:
-    (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-    return run
 
 
 def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):

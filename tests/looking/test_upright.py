@@ -10,7 +10,6 @@ from upright_scenes import TURNS, plates, room, tower, turned
 
 from making import ball, box_room, in_pictures
 from pointsplat_ns.api import example_room
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import turning
 from pointsplat_ns.looking.content import content_size, thinned
@@ -20,7 +19,7 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoPlaces
-from pointsplat_ns.looking.upright import Up, axis_named, levelness, pointing_up, upright_axis
+from pointsplat_ns.looking.upright import Up, levelness, pointing_up, upright_axis
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -109,12 +108,6 @@ def test_where_photos_were_taken_decides_between_axes_that_suit_alike():
         ring[:, (axis + 1) % 3], ring[:, (axis + 2) % 3] = 8 * PLACES.cos().double(), 8 * PLACES.sin().double()
         found = upright_axis(surface, PhotoPlaces(ring, torch.full((60,), 1 / 60)))
         assert float(found[axis].abs()) > math.cos(math.radians(3))
-
-
-@pytest.mark.parametrize("name", ["w", "", "--z", "zz", "1"])
-def test_other_names_of_axes_are_refused(name):
-    with pytest.raises(PointSplatError, match="expected x, y, z, -x, -y or -z"):
-        axis_named(name)
 
 
 def statue() -> Gaussians:

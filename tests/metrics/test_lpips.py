@@ -125,12 +125,6 @@ def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net,
         model(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
 
 
-# As a part of a model
-
-
-# Loaded once
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """Empty caches, and the time that failures are remembered by, in a list of one number."""
@@ -139,9 +133,6 @@ def clock(monkeypatch):
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._failures", failures)
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._loaded", cachetools.LRUCache(4))
     return now
-
-
-# In a report
 
 
 def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, clock, monkeypatch):

@@ -55,17 +55,6 @@ def bits(value):
     return value.contiguous().view(torch.int32)
 
 
-def test_merging_comes_first_and_coverage_second():
-    assert list(METHODS)[:2] == ["merge", "coverage"]
-
-
-@pytest.mark.parametrize("by", METHODS)
-def test_every_method_has_its_own_name_and_a_summary_of_one_clause(by):
-    summary = METHODS[by].summary
-    assert METHODS[by].name == by
-    assert summary and len(summary) < 100 and not summary.endswith(".") and "\n" not in summary
-
-
 @pytest.mark.parametrize("by", SCORES)
 @pytest.mark.parametrize(("keep", "k"), [(0.3, 15), (1, 1), (1.0, 50), (37, 37)])
 def test_a_score_keeps_the_k_highest_bit_for_bit_and_in_order(by, keep, k):
@@ -93,12 +82,6 @@ def test_progress_rises_to_one(by):
     shares = []
     prune(normal_scene(60, 1), 0.3, by, views=views(), progress=shares.append)
     assert shares and shares == sorted(shares) and shares[-1] == 1.0
-
-
-@pytest.mark.parametrize("keep", ["auto", "auto:35", WithinPsnr(35.0)])
-def test_a_budget_that_needs_renders_is_refused(keep):
-    with pytest.raises(BudgetError, match="keep is auto, which is found by rendering"):
-        prune(normal_scene(60, 1), keep)
 
 
 @pytest.mark.parametrize("by", WITHOUT_VIEWS)

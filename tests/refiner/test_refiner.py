@@ -230,9 +230,6 @@ def assert_finite(refiner: Refiner, scene: Gaussians, name: str) -> None:
     assert refiner.heads.mlps["features_dc"][-1].bias.grad.abs().max() > 0, name
 
 
-"""The published grid, stages, strides, heads and patches, in fewer channels and blocks for the sake of time."""
-
-
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
 def test_unusable_gaussians_come_back_unchanged_and_the_others_as_if_those_were_not_there(name, bad):

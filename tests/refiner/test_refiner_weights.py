@@ -215,14 +215,6 @@ def full_grid(side: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(side), repeat=3)))
 
 
-@pytest.mark.parametrize("curve", ["hilbert", "hilbert-trans"])
-@pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_consecutive_cells_of_the_hilbert_curve_share_a_face(curve, bits):
-    cells = full_grid(2**bits)
-    walk = cells[curve_codes(cells, bits, [curve])[0].argsort()]
-    assert ((walk[1:] - walk[:-1]).abs().sum(dim=1) == 1).all()
-
-
 @pytest.mark.parametrize("bits", [16, 20])
 def test_z_order_equals_python_interleaving_at_full_width(bits):
     generator = torch.Generator().manual_seed(0)

@@ -14,7 +14,7 @@ from pointsplat_ns.refiner.config import FINE_BITS
 from pointsplat_ns.refiner.encoder import DualBranchEncoder
 from pointsplat_ns.refiner.normalize import gaussian_features, unit_cube
 from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
-from pointsplat_ns.refiner.structure import HALF_KERNEL, STRUCTURE, StructureSettings, build_structure, neighbour_pairs
+from pointsplat_ns.refiner.structure import STRUCTURE, StructureSettings, build_structure, neighbour_pairs
 
 
 def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
@@ -120,12 +120,6 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 def grid_cells(side: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(side), repeat=3)))
-
-
-def test_half_kernel_and_its_mirror_are_the_26_neighbours_in_tap_order():
-    taps = list(itertools.product((-1, 0, 1), repeat=3))
-    assert HALF_KERNEL == taps[14:]
-    assert [tuple(-d for d in offset) for offset in HALF_KERNEL] == taps[12::-1]
 
 
 def test_submanifold_convolution_on_scattered_cells_equals_dense_with_zeros_elsewhere():
