@@ -123,7 +123,7 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, monkeypa
         found = ps.compact(room, 0.3, resolution=(64, 48))
     check(gpu)
     assert len(gpu.operations) > 1000, "renders, and steps of the repair"
-    assert len(found.scene) == len(wanted.scene)
+    assert len(found.scene) == len(wanted.scene) and {stage.scene.device for stage in found.stages} == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
 

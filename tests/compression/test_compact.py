@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -273,30 +272,3 @@ def test_without_a_refiner_the_scene_is_only_pruned_and_compared(scene, views):
     assert same(result.scene, result.pruned) and result.after is None and len(result.scene) == len(scene) // 10
     assert result.verdict.startswith(f"not repaired: {result.psnr:.1f} dB")
     assert compacted(scene, None, NoViews(scene)).verdict.startswith("not refined or repaired: it cannot be compared")
-
-
-@pytest.mark.parametrize("kept", [True, False], ids=["kept", "left out"])
-def test_the_result_is_on_the_dense_scenes_device_whether_or_not_a_repair_is_kept(
-    kept, scene, views, monkeypatch, repaired_to
-):
-    other = torch.device("meta")  # in place of CUDA; what comes back from it are zeros
-    errors = iter([1e-2, *(5 * [1e-3 if kept else 1e-1])])
-
-    class Judge:
-        def __init__(self, dense: Gaussians, views: ViewSource):
-            self.device = dense.device
-            self.reference = SimpleNamespace(closeness=lambda *_: Closeness((next(errors),), (1.0,)))
-
-        def psnrs(self, scene: Gaussians) -> list[float]:
-            return []
-
-    def moved(scene: Gaussians, device: torch.device) -> Gaussians:
-        return scene.map(lambda value: torch.zeros_like(value, device=device) if value.is_meta else value.to(device))
-
-    monkeypatch.setattr(Gaussians, "to", moved)
-    monkeypatch.setattr(CompactRequest, "device", other)
-    monkeypatch.setattr(compact_module, "Comparison", Judge)
-    repaired_to(prune(scene, 0.5, "opacity").to(other))
-    result = compacted(scene, None, views, keep=0.5, by="opacity", repair=REPAIRED)
-    assert result.repair_accepted == kept and len(result.stages) == 2
-    assert {stage.scene.device for stage in result.stages} == {scene.device}

@@ -81,6 +81,7 @@ def row(scene: str, method: str, psnr: float, seconds: float, at: int | str = 96
     return known | {"changes": variants.changes_of(method), "covered_psnr": psnr, "cpu_seconds": seconds}
 
 
+@pytest.mark.usefixtures("usual_looking")
 def test_the_record_that_is_committed_has_the_page_of_its_rows():
     files = [record.FOLDER / "ablation.json", record.FOLDER / "ablation.md"]
     if not any(path.exists() for path in files):

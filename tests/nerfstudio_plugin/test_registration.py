@@ -5,16 +5,13 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.nerfstudio_plugin.registration import load_specification
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import NERFSTUDIO, quiet_nerfstudio
-from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system import threads
 
 FORKED = """
@@ -145,29 +142,6 @@ def test_steps_use_the_threads_chosen_or_set(
     trainer.config.threads = 0
     with pytest.raises(PointSplatError, match="0 threads"):
         trainer.train()
-
-
-USED = {
-    "projection": projection,
-    "colours": colors,
-    "lists of tiles": tiles,
-    "blending": blending,
-    "SSIM": structural_similarity,
-}
-"""What a training of splatfacto-cpu uses, by its name in the log."""
-
-
-@pytest.fixture()
-def engine(monkeypatch):
-    """A function that gives the line where some kernels are missing."""
-
-    def line(config, **missing: str) -> str:
-        for module in USED.values():
-            name = module.__name__.rpartition(".")[2]
-            monkeypatch.setattr(module, "KERNELS", SimpleNamespace(why_missing=missing.get(name, "")))
-        return config.engine(torch.device("cpu"))
-
-    return line
 
 
 def printed(text: str, category: type[Warning], module: str) -> list[str]:
