@@ -161,16 +161,13 @@ def test_requirements_are_what_is_imported():
         imported = {name.split(".")[0] for name in imports_of(path)} - {"pointsplat_ns", "method_configs", "_typeshed"}
         inside = path.is_relative_to(package / "nerfstudio_plugin") or not path.is_relative_to(package)
         (plugin if inside else rest).update(imported - set(sys.stdlib_module_names))
-    assert _distributions(rest - WITH_ANOTHER.keys()) <= core
-    assert _distributions((plugin | rest) - WITH_ANOTHER.keys()) == (core | more) - BY_NAME
-
-
-def _distributions(imported: set[str]) -> set[str]:
-    """The distributions that imported packages belong to. OpenCV's two share their package; nerfstudio takes that
-    without a window."""
     homes = metadata.packages_distributions()
-    found = {canonicalize_name(name) for package in imported for name in homes[package]}
-    return found - {"opencv-python"}
+
+    def distributions(imported: set[str]) -> set[str]:
+        found = {canonicalize_name(name) for package in imported - WITH_ANOTHER.keys() for name in homes[package]}
+        return found - {"opencv-python"}  # shares its package with that without a window, which nerfstudio takes
+
+    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - BY_NAME
 
 
 @pytest.fixture()

@@ -24,6 +24,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ra
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.refiner.layers import BatchNorm
 from pointsplat_ns.system.processes import average_gradients, gathered
+from quick_looking import QUICK, looking
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -288,7 +289,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 
 if __name__ == "__main__":
     child = os.fork()  # nothing has been computed, so there are no threads yet
-    with views_sampled_once():
+    with looking(QUICK), views_sampled_once():
         work(0 if child else 1, Path(sys.argv[1]))
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
