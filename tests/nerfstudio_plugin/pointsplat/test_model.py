@@ -14,7 +14,7 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA, parsed_by_ns_train, pipeline_of, run_of, same, small_config
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
