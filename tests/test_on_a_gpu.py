@@ -43,7 +43,7 @@ def check(gpu) -> None:
     assert gpu.operations and not gpu.from_other_threads() and not gpu.linear_algebra()
 
 
-def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_devices(room):
+def test_the_pretended_gpu_notices_other_threads_and_mixed_devices(room):
     with pretend_gpu() as gpu:
         means = room.means.to(GPU)
         with pytest.raises(RuntimeError, match="expected one device"):
@@ -56,7 +56,7 @@ def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_device
         assert gpu.from_other_threads() == {"aten.pow.Tensor_Scalar"}
 
 
-def test_several_views_of_a_scene_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
+def test_views_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
     on_cpu = ps.render(room, views)
     with pretend_gpu() as gpu:
         drawn = torch.stack(list(each_view(room.to(GPU), views, ps.render))).cpu()

@@ -85,7 +85,7 @@ def views(scene) -> Views:
     return sample_views(scene, 3, 48, 36)
 
 
-def test_a_refiner_that_helps_is_kept_and_the_figures_are_those_of_the_renders(scene, views):
+def test_a_refiner_that_helps_is_kept_with_the_figures_of_its_renders(scene, views):
     # Half of the blobs are gone, the most opaque are left: larger ones close the holes.
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views)
     pruned = prune(scene, 0.5, "opacity")
@@ -121,7 +121,7 @@ def test_a_refiner_that_goes_too_far_is_taken_part_of_the_way(scene, views):
     assert result.after.psnr - result.before.psnr > 2 / 3 * (best - result.before.psnr) > 0
 
 
-def test_a_share_of_the_way_is_linear_in_what_is_stored_and_finite_where_the_start_is():
+def test_a_share_of_the_way_is_linear_and_finite_where_the_start_is():
     before = room(20)
     before.opacities[0], before.scales[1, 2] = math.inf, -math.inf
     after = before.map(lambda value: value + 2.0)
@@ -168,7 +168,7 @@ def test_what_is_not_finite_never_gets_out(scene, views):
         assert result.verdict == "not refined by the network: 7 of 200 refined Gaussians are not finite"
 
 
-def test_without_a_place_to_look_from_refinement_is_left_out_and_the_reason_is_said(scene):
+def test_without_views_refinement_is_left_out_with_the_reason(scene):
     result = compacted(scene, trained(tiny_refiner("scales", 0.2)), NoViews(scene))
     assert not result.accepted and same(result.scene, prune(scene, 0.5, "opacity"))
     assert result.reference is None and result.views is None and result.psnr is None

@@ -131,7 +131,7 @@ def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_
     assert len(set(taken[1::2])) == 16 and not set(taken[1::2]) & (left | compared)
 
 
-def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(hollow_ball):
+def test_views_sampled_beside_few_given_ones_have_their_background(hollow_ball):
     few = sample_views(hollow_ball, 3, 48, 36)
     white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
     taken = list(itertools.islice(ViewSource(hollow_ball, given=white).others(), 40))

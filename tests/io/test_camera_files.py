@@ -97,7 +97,7 @@ def test_one_of_several_models_of_colmap_is_read_and_the_others_are_named(tmp_pa
     assert "one of several models; not read: 1, 2" in caplog.text
 
 
-def test_poses_of_ns_export_are_in_the_frame_of_the_scene_and_lack_intrinsics(tmp_path, caplog):
+def test_poses_of_ns_export_are_in_the_scenes_frame_without_intrinsics(tmp_path, caplog):
     views = some_views()
     poses = viewmats_to_opengl(views.viewmats.double()).tolist()
     entries = [{"file_path": f"/photos/{name_of(i)}", "transform": pose} for i, pose in enumerate(poses)]
@@ -212,7 +212,7 @@ def test_no_photo_outside_of_the_folder_is_opened(tmp_path):
         assert read_views(written(content, tmp_path / "in" / "transforms.json")).width == 800
 
 
-def test_an_early_file_beside_a_colmap_model_has_the_transform_that_nerfstudio_applied_then(tmp_path):
+def test_an_early_file_beside_colmap_has_nerfstudios_transform_of_then(tmp_path):
     content = nerfstudio(some_views(1))
     (tmp_path / "dataparser_transforms.json").write_text(moved_as(torch.eye(4)[:3], 1.0))
     (tmp_path / "colmap/sparse/0").mkdir(parents=True)

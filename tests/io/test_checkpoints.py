@@ -49,7 +49,7 @@ def test_a_checkpoint_of_gsplat_is_read_to_the_bit(tmp_path, degree):
 @pytest.mark.parametrize(
     "settings", ["antialiased: true\n", "antialiased: false\n", "nested:\n  antialiased: true\n", None]
 )
-def test_the_settings_of_a_training_with_gsplat_say_whether_it_is_drawn_antialiased(tmp_path, settings):
+def test_settings_of_a_gsplat_training_tell_whether_it_is_antialiased(tmp_path, settings):
     path = tmp_path / "results" / "ckpts" / "ckpt_29999_rank0.pt"
     path.parent.mkdir(parents=True)
     torch.save({"step": 29999, "splats": splats_of(GOOD)}, path)

@@ -123,7 +123,7 @@ def test_spz_4_holds_what_spz_3_holds(tmp_path):
     assert same_bits(ps.load(tmp_path / "3.spz"), ps.load(tmp_path / "4.spz"))
 
 
-def test_a_sog_folder_is_read_by_either_of_its_names_and_holds_what_the_file_holds(tmp_path):
+def test_a_sog_folder_is_read_by_both_names_and_equals_the_file(tmp_path):
     scene = cloud(1500, 0, 3)
     ps.save(scene, tmp_path / "room" / "meta.json")
     ps.save(scene, tmp_path / "room.sog")

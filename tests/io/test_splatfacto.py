@@ -148,7 +148,7 @@ OTHER_METHOD = {"step": 1, "pipeline": {f"_model.field.mlp.{i}.weight": torch.ze
          ["another method", "_model.field.mlp.0.weight", "and 2 more", "_model.gauss_params.means"]),
     ],
 )  # fmt: skip
-def test_a_file_that_is_no_checkpoint_of_splatfacto_is_said_with_what_it_holds(tmp_path, content, found):
+def test_a_file_that_is_no_checkpoint_is_an_error_that_names_its_content(tmp_path, content, found):
     path = tmp_path / "a.ckpt"
     path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
     fails(path, *found)

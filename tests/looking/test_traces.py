@@ -211,14 +211,14 @@ def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses(scene, trained
     assert source.origin == f"sampled poses, up is {source.up} (no dataset: its data is not there)"
 
 
-def test_a_run_whose_data_is_gone_and_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
+def test_a_run_without_data_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
     nothing = ViewSource(scene[:0], run=run_of(trained_walls, "wall-a"), dataset_views=data_is_gone)
     with pytest.raises(DataError, match="nothing of the scene can be seen"):
         nothing.views(2)
     assert nothing.origin == ""
 
 
-def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_given_ones(scene):
+def test_a_resolution_is_that_of_sampled_views_and_bounds_given_ones(scene):
     asked = ViewSource(scene, resolution=(96, 54)).views(2)
     assert (asked.width, asked.height) == (96, 54)
     given = sample_views(scene, 2, 900, 600)
@@ -226,13 +226,13 @@ def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_give
     assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
 
 
-def test_a_scene_without_known_views_is_repaired_before_another_background_as_well(scene):
+def test_a_scene_without_known_views_is_repaired_on_two_backgrounds(scene):
     views = ViewSource(scene, resolution=(64, 48)).others()
     behind = [next(views).background.tolist() for _ in range(10)]
     assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8
 
 
-def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):
+def test_views_sampled_beside_few_known_ones_have_their_mode(scene):
     given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
     assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
 

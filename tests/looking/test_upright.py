@@ -50,7 +50,7 @@ def part_of_the_example_room() -> Gaussians:
 
 
 @pytest.mark.parametrize("axis", SIX)
-def test_what_stands_along_an_axis_of_the_world_is_found_there_whichever_it_is(axis, part_of_the_example_room):
+def test_a_scene_along_any_axis_of_the_world_is_found_upright(axis, part_of_the_example_room):
     turn, _ = Rotation.align_vectors([axis], [[0, 0, 1]])
     matrix = torch.from_numpy(turn.as_matrix()).round()
     for scene in (turned(tower(), turn), turning.turned(part_of_the_example_room, matrix)):
@@ -162,7 +162,7 @@ def test_a_room_is_first_seen_from_inside_and_then_from_other_sides():
     assert float(shown.any(0).double().mean()) > float(shown[0].double().mean()) + 0.1, "the others show more"
 
 
-def test_photos_of_a_room_come_before_a_view_from_outside_and_keep_their_background():
+def test_photos_of_a_room_come_before_a_view_from_outside():
     scene = room()
     eyes = torch.tensor([[-1.5, -1.0, 0.3], [1.5, 1.0, 0.3], [0.0, 0.0, 0.2]], dtype=torch.float64)
     targets = torch.tensor([[1.5, 1.0, -0.5], [-1.5, -1.0, -0.5], [0.0, 0.0, 1.2]], dtype=torch.float64)

@@ -115,7 +115,7 @@ def test_value_and_gradient_in_float32_are_those_of_float64(alex):
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net, tmp_path):
+def test_the_smallest_image_works_and_smaller_ones_are_refused(net, tmp_path):
     torch.save(random_backbone(net), tmp_path / "b.pth")
     model, least = load_lpips(net, tmp_path / "b.pth"), {"alex": 31, "vgg": 16}[net]
     assert model(*pair(least, least + 5)).isfinite()

@@ -70,7 +70,7 @@ def test_a_score_keeps_the_k_highest_bit_for_bit_and_in_order(by, keep, k):
 
 
 @pytest.mark.parametrize("by", WITH_VIEWS)
-def test_a_score_from_views_keeps_the_highest_also_of_views_that_are_made_when_due(by):
+def test_a_score_from_views_keeps_the_highest_also_of_lazy_views(by):
     scene = normal_scene(60, 1)
     wanted = select(METHODS[by].score(scene, views()), 18)
     assert torch.equal(kept(scene, 0.3, by, views=views()), wanted)
@@ -103,7 +103,7 @@ def test_a_scene_with_no_gaussian_or_none_that_can_be_drawn_is_refused(by):
         ),
     ],
 )
-def test_a_method_that_does_not_exist_or_does_not_take_its_options_is_refused(by, options, message):
+def test_an_unknown_method_and_options_it_does_not_take_are_refused(by, options, message):
     with pytest.raises(PointSplatError, match=message) as caught:
         prune(normal_scene(60, 1), 0.3, by, **{"views": views(), **options})
     assert isinstance(caught.value, DataError) == ("expected views" in message)
@@ -137,7 +137,7 @@ def test_settings_refuse_a_budget_that_is_neither_a_ratio_nor_a_count(keep):
         ("merge", 0.5, "merge does not weigh opacity; .* one of paper, authors, log-volume$"),
     ],
 )
-def test_settings_refuse_methods_and_options_that_prune_refuses_and_methods_that_need_views(by, weight, message):
+def test_settings_refuse_what_prune_refuses_and_methods_that_need_views(by, weight, message):
     with pytest.raises(PointSplatError, match=message):
         PruneSettings(0.3, by, opacity_weight=weight)
 

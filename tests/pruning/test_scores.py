@@ -39,7 +39,7 @@ def test_paper_score_is_equation_3_with_the_papers_weight_by_default(weight, dty
     assert torch.allclose(found, equation_3(scene, 0.3 if weight is None else weight), rtol=1e-12, atol=1e-12)
 
 
-def test_a_ball_outranks_a_pancake_of_smaller_volume_and_the_authors_score_ranks_them_the_other_way_around():
+def test_authors_rank_a_pancake_above_a_ball_and_the_paper_below():
     scales = torch.log(torch.tensor([[0.1, 0.1, 1e-5], [0.01, 0.01, 0.01], [0.02, 0.02, 0.02]]))
     scene = normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1))
     volume, product = SCORES["paper"](scene), SCORES["authors"](scene)

@@ -48,7 +48,7 @@ def test_a_lower_memory_budget_changes_neither_image_nor_gradients(pairs):
     assert_same(got, wanted, 1e-12)  # sums over regions in another order
 
 
-def test_every_function_of_the_package_with_a_gradient_of_its_own_says_that_this_has_none():
+def test_every_gradient_of_the_package_is_once_differentiable():
     for part in ("rasterizer", "refiner", "metrics"):
         package = importlib.import_module(f"pointsplat_ns.{part}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):

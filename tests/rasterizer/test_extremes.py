@@ -280,7 +280,7 @@ def test_places_and_lenses_of_the_camera(case):
     check(scene, (view, K), size)
 
 
-def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
+def test_views_in_float64_place_the_camera_exactly_in_any_unit():
     means, quats, scales, opacities, sh = make_scene(50)
     scene = Gaussians(means, scales.log(), quats, torch.logit(opacities)[:, None], sh[:, 0], sh[:, 1:])
     view, K = camera_askew()

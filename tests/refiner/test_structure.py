@@ -77,7 +77,7 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
 
 
 @pytest.mark.parametrize("spread", [1, 3, 100, 2**16 - 1])
-def test_looking_up_and_searching_find_the_pairs_that_brute_force_finds_in_order(spread, monkeypatch):
+def test_neighbour_pairs_are_those_of_brute_force_in_order(spread, monkeypatch):
     g = torch.Generator().manual_seed(4)
     cells = torch.cat([torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])])
     cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(0, spread)
@@ -122,7 +122,7 @@ def grid_cells(side: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(side), repeat=3)))
 
 
-def test_submanifold_convolution_on_scattered_cells_equals_dense_with_zeros_elsewhere():
+def test_submanifold_convolution_equals_dense_with_zeros_elsewhere():
     side, cin, cout = 8, 2, 3
     cells = grid_cells(side)[torch.randperm(side**3, generator=seeded())[:90]]
     x = torch.randn(90, cin, dtype=torch.float64, generator=seeded(1))
@@ -159,7 +159,7 @@ def test_segments_are_reduced_as_by_a_loop_and_pass_gradcheck(segment, reduce):
 
 
 @pytest.mark.parametrize("size", ["tiny", "small"])
-def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(size, monkeypatch):
+def test_the_refiner_gives_the_same_in_pieces_of_any_size(size, monkeypatch):
     scene = normal_scene(700, dtype=torch.float64)
     torch.manual_seed(0)
     refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())

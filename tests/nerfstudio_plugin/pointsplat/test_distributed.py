@@ -179,7 +179,7 @@ def together(tmp_path_factory):
     return found, alone
 
 
-def test_losses_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
+def test_two_processes_train_as_one_with_twice_the_batch(together):
     found, alone = together
     for key, tolerance in (("losses", 1e-5), ("psnr", 1e-5)):  # float32 sums in another order, through three updates
         wanted = [(a + b) / 2 for a, b in zip(alone[key][::2], alone[key][1::2], strict=True)]
@@ -210,7 +210,7 @@ def test_processes_share_the_repairs_that_a_feedback_refiner_learns_from(togethe
     assert [part["feedback written"] for part in found] == [True, False]
 
 
-def test_a_training_interrupted_between_two_updates_ends_as_an_unbroken_one(together):
+def test_a_training_resumed_between_two_updates_is_as_an_unbroken_one(together):
     for part in together[0]:
         whole, rest = part["skipping"]
         assert f"step-{2:09d}.ckpt" in together[0][0]["skipping"][0]["files"], "it was saved with gradients in waiting"

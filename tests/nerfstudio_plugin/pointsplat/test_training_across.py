@@ -77,9 +77,7 @@ def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained
     assert losses["dense"] < 0.5 / 255 and losses["photos"] > 5 / 255
 
 
-def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken_one(
-    three_rooms, run_training, tmp_path
-):
+def test_an_interrupted_training_resumes_as_an_unbroken_one(three_rooms, run_training, tmp_path):
     stop, accumulate, schedule, skipped = 4, 3, "step", {1, 4, 6}
 
     def config(name, steps):
@@ -105,7 +103,7 @@ def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken
     assert "gradients" in state, "those that wait for their update are saved"
 
 
-def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(three_rooms):
+def test_random_choices_after_resuming_are_those_of_an_unbroken_run(three_rooms):
     pipeline = dense_config(three_rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val").train()
     blocks = [m for m in pipeline.model.refiner.modules() if hasattr(m, "drop_path")]
     for block in blocks:
@@ -144,7 +142,7 @@ def test_accumulated_gradients_are_averaged_before_they_are_clipped(three_rooms,
 
 
 @pytest.mark.parametrize("steps", [{"hands": 2}, {"encoder": 0}])
-def test_an_accumulation_that_means_nothing_is_refused_and_leaves_no_folder(three_rooms, tmp_path, steps):
+def test_a_meaningless_accumulation_is_refused_and_leaves_no_folder(three_rooms, tmp_path, steps):
     config = dense_config(three_rooms, tmp_path / "outputs", 1)
     config.gradient_accumulation_steps = steps
     config.save_config()

@@ -196,7 +196,7 @@ def test_members_fit_better_each_time_and_no_group_is_left_empty():
     assert reached[1] > reached[0] + 0.5 and reached[2] > reached[1]
 
 
-def test_a_member_in_the_wrong_group_changes_by_its_position_and_by_its_colour():
+def test_a_member_changes_its_group_by_position_and_by_colour():
     scene = cloud(200)
     means, colours = scene.means.clone(), torch.zeros_like(scene.features_dc)
     side = ALL % 2
