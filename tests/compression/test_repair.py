@@ -17,6 +17,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
+from quick_looking import USUAL, looking
 
 
 @pytest.fixture(autouse=True)
@@ -51,9 +52,10 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     """In a room that the network was not trained on, and in views that no step has seen."""
     monkeypatch.setitem(STEPS, "quick", 6)
     room = example_room()
-    pruned = prune(room, 0.1, "merge")
-    reference = DenseReference(room, sample_views(room, 6, 160, 120, seed=99))
-    source = ViewSource(room, given=sample_views(room, 32, 160, 120, seed=98))
+    with looking(USUAL):
+        pruned = prune(room, 0.1, "merge")
+        reference = DenseReference(room, sample_views(room, 6, 160, 120, seed=99))
+        source = ViewSource(room, given=sample_views(room, 32, 160, 120, seed=98))
     learned, plain = (
         repair(pruned, room, source, RepairBudget("quick"), network=network).scene for network in ("shipped", None)
     )
