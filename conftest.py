@@ -1,4 +1,4 @@
-"""What keeps tests and the examples in docstrings quick: smaller views, no repair, coarse rooms."""
+"""What keeps tests and the examples in docstrings quick: few and small views, no repair, coarse rooms."""
 
 from __future__ import annotations
 
@@ -9,6 +9,21 @@ import pytest
 from lab.rooms import light
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
+from quick_looking import QUICK, USUAL, looking
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_looking() -> Iterator[None]:
+    """Views are chosen from few candidates, unless a test is about which are chosen."""
+    with looking(QUICK):
+        yield
+
+
+@pytest.fixture(scope="module")
+def usual_looking() -> Iterator[None]:
+    """The settings of looking as they ship, for tests of what they are good for."""
+    with looking(USUAL):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

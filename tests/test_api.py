@@ -4,7 +4,6 @@ import doctest
 import inspect
 import logging
 import math
-import shutil
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns import api
 from pointsplat_ns.cli import main
 from pointsplat_ns.pruning import resolve_keep
 
@@ -34,9 +32,9 @@ ps.save(result.scene, "small.ply")
 
 @pytest.fixture(scope="module")
 def ten_lines(tmp_path_factory) -> dict:
-    """What the ten lines leave behind, with the scene that ships as room.ply."""
+    """What the ten lines leave behind, with an eighth of the scene that ships as room.ply."""
     folder = tmp_path_factory.mktemp("ten_lines")
-    shutil.copy(api.EXAMPLE, folder / "room.ply")
+    ps.save(ps.example_room()[::8], folder / "room.ply")
     names: dict = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -52,7 +50,7 @@ def test_the_ten_lines_make_a_scene_of_a_tenth(ten_lines):
 def test_the_ten_lines_compact_what_they_prune(ten_lines):
     result = ten_lines["result"]
     assert same(result.pruned, ten_lines["small"])
-    assert not result.accepted and result.psnr >= result.before.psnr > 20
+    assert not result.accepted and result.psnr >= result.before.psnr > 15
     assert 0 < result.seconds < 3600
 
 

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import box_room, dense_config, fast_config, same
+from making import box_room, dense_config, fast_config, same, small_refiner
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system.threads import fixed_threads
 from pretend_gpu import GPU, pretend_gpu
 
@@ -42,7 +43,7 @@ def check(gpu) -> None:
     assert gpu.operations and not gpu.from_other_threads() and not gpu.linear_algebra()
 
 
-def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_devices(room):
+def test_the_pretended_gpu_notices_other_threads_and_mixed_devices(room):
     with pretend_gpu() as gpu:
         means = room.means.to(GPU)
         with pytest.raises(RuntimeError, match="expected one device"):
@@ -55,7 +56,7 @@ def test_the_pretended_gpu_notices_other_threads_linear_algebra_and_mixed_device
         assert gpu.from_other_threads() == {"aten.pow.Tensor_Scalar"}
 
 
-def test_several_views_of_a_scene_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
+def test_views_on_a_gpu_are_drawn_in_the_thread_that_asks(room, views):
     on_cpu = ps.render(room, views)
     with pretend_gpu() as gpu:
         drawn = torch.stack(list(each_view(room.to(GPU), views, ps.render))).cpu()
@@ -122,14 +123,16 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, monkeypa
         found = ps.compact(room, 0.3, resolution=(64, 48))
     check(gpu)
     assert len(gpu.operations) > 1000, "renders, and steps of the repair"
-    assert len(found.scene) == len(wanted.scene)
+    assert len(found.scene) == len(wanted.scene) and {stage.scene.device for stage in found.stages} == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
 
 
-def test_a_refiner_and_levels_of_detail_are_computed_on_a_gpu_from_one_thread(room, computed_there):
+def test_a_refiner_and_levels_are_computed_on_a_gpu_from_one_thread(room, computed_there, tmp_path):
+    save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
     with pretend_gpu() as gpu:
-        refined = ps.compact(room, 0.5, ps.load_refiner(), effort="instant", resolution=(64, 48))
+        refiner = ps.load_refiner(tmp_path / "small.safetensors")
+        refined = ps.compact(room, 0.5, refiner, effort="instant", resolution=(64, 48))
         levels = ps.lod(room.to(GPU), ["50%", "20%"], resolution=(64, 48))
         assert len(refined.scene) == 200 and [len(level.scene) for level in levels] == [200, 80]
     check(gpu)

@@ -32,7 +32,7 @@ from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths, means_around
 from pointsplat_ns.looking.upright import level_directions
 from pointsplat_ns.rasterizer import pixels_of
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
 MIN_EMPTY = 0.01
@@ -97,7 +97,7 @@ class Candidates:
     def views(self, count: int, generator: torch.Generator, likeliest: bool = False) -> Tensor:
         """World-to-camera matrices (count, 4, 4), float64, of likely views that complete each other, or of the
         likeliest ones, which may show the same."""
-        drawn = self._drawn(max(64, LOOKING.candidates_per_view * count), generator)
+        drawn = self._drawn(max(LOOKING.min_candidates, LOOKING.candidates_per_view * count), generator)
         likelihoods, shown = self.judged(views_of(drawn, *self.resolution, UNITS))
         return drawn[likelihoods.topk(count).indices if likeliest else self.completing(likelihoods, shown, count)]
 
@@ -129,15 +129,14 @@ class Candidates:
         return torch.cat([self._at_gaussians(count - half, generator), self._from_places(half, generator)])
 
     def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) that look at Gaussians, from where their neighbourhood is as small as in photos, or, if
-        that is too far away, from any distance."""
+        """Cameras (count, 4, 4) that look at Gaussians at any pitch, from where their neighbourhood is as small as in
+        photos, or, if that is too far away, from any distance."""
         aim = self._targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
         small, large = LOOKING.apparent_sizes
         distance = self.widths_around[aim].exp() / (small * (large / small) ** angle)
         distance = torch.where(distance < UNITS, distance, UNITS * angle).clamp_min(0.01 * UNITS)
-        low, high = LOOKING.pitches
-        pitch = torch.deg2rad(low + (high - low) * pitch)
+        pitch = math.pi * (pitch - 0.5)
         ahead = pitch.cos()[:, None] * level_directions(self.up, 2 * math.pi * turn) + pitch.sin()[:, None] * self.up
         target = self.few.means[aim].double()
         below = ((target - distance[:, None] * ahead) @ self.up < self._floor).to(ahead.dtype)
@@ -145,20 +144,13 @@ class Candidates:
         return look_at(target - distance[:, None] * ahead, target, self.up)
 
     def _from_places(self, count: int, generator: torch.Generator) -> Tensor:
-        """Cameras (count, 4, 4) near photo places, which are drawn by their shares. Each looks at one of a few
-        Gaussians, the one at the most usual pitch."""
+        """Cameras (count, 4, 4) near photo places, which are drawn by their shares, each looking at a Gaussian."""
         assert self.places is not None
         drawn = torch.multinomial(self.places.shares.float(), count, replacement=True, generator=generator)
         offsets = torch.randn(count, 3, generator=generator, **DOUBLES)
         eyes = self.places.places[drawn] + LOOKING.photo_place_deviation * offsets
         eyes = eyes + (self._floor - eyes @ self.up).clamp_min(0)[:, None] * self.up
-        aim = self._targets(count * LOOKING.aims, generator).view(count, LOOKING.aims)
-        targets = self.few.means[aim].double()
-        ahead = targets - eyes[:, None]
-        rise = (ahead @ self.up) / ahead.norm(dim=2).clamp_min(1e-9)
-        pitch = torch.rad2deg(torch.asin(rise.clamp(-1, 1)))
-        usual = (pitch + 10.0).abs().argmin(1)  # photos look down by 10 degrees on average
-        return look_at(eyes, targets[torch.arange(count, **INDICES), usual], self.up)
+        return look_at(eyes, self.few.means[self._targets(count, generator)].double(), self.up)
 
     def _targets(self, count: int, generator: torch.Generator) -> Tensor:
         """Indices (count,) of Gaussians to look at, each as likely as any other."""

@@ -110,20 +110,17 @@ class LookingSettings:
     candidates_per_view: int = 8
     """Number of candidates for each view."""
 
+    min_candidates: int = 64
+    """Smallest number of candidates."""
+
     half_gain_coverage: float = 0.5
     """Number of views that show a Gaussian at which one more counts a half."""
 
     apparent_sizes: tuple[float, float] = (0.0015, 0.0175)
     """Angles that the Gaussians around the one in the middle subtend, radians: 2 to 24 pixels of 1920."""
 
-    pitches: tuple[float, float] = (-50.0, 10.0)
-    """Lowest and highest pitch of a camera that looks at a Gaussian from any side, degrees; above 0 is up."""
-
     photo_place_deviation: float = 0.15
     """Standard deviation of candidates from photo places along each axis, units."""
-
-    aims: int = 4
-    """Number of Gaussians from which a camera at a photo place chooses the one at the most usual pitch."""
 
     # Sizes of pictures (sizes.py)
 

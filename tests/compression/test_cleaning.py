@@ -20,6 +20,8 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
 from pointsplat_ns.views import Views
 
+pytestmark = pytest.mark.usefixtures("usual_looking")
+
 ROOM, THINGS, PLANTED = 5500, 3000, 12
 
 

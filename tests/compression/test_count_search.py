@@ -52,7 +52,7 @@ def searched(measure, target, at_least, first=30_000, **options):
 @pytest.mark.parametrize("at_least", [True, False])
 @pytest.mark.parametrize("share", [0.001, 0.07, 0.3, 0.5, 0.99])
 @pytest.mark.parametrize("name", MEASURES)
-def test_the_count_meets_the_target_and_a_neighbour_that_was_tried_does_not(name, share, at_least):
+def test_the_count_meets_the_target_and_its_tried_neighbour_does_not(name, share, at_least):
     measure = MEASURES[name]
     target = measure(round(share * MOST))
     found, tried = searched(measure, target, at_least)
@@ -194,7 +194,7 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
 
 
 @pytest.mark.parametrize("kept", [1e-9, 0.1, 0.5, 0.9, 1 - 1e-9])
-def test_the_psnr_of_rounding_falls_by_the_slope_also_where_merging_errs_less_and_less(kept):
+def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
     """If the error of merging is A (kept^-p - 1), rounding goes by A kept^-p."""
     power = 10 ** (-BUDGETS.slope * math.log(kept) / 10)
     merged = 40 - 10 * math.log10(power - 1)
@@ -206,7 +206,7 @@ def test_all_gaussians_are_rounded_by_their_own_psnr():
     assert few_psnr(math.inf, 1.0) == math.inf and few_psnr(40.0, 1.0) == 40.0
 
 
-def test_a_scene_is_rounded_further_if_it_is_too_large_and_less_if_there_is_room():
+def test_a_scene_is_rounded_as_far_as_its_size_needs():
     scene, kind, usual = cloud(2000), format_to_write(".spz"), Rounding(0.002)
     size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
     for most in (int(0.9 * size), size, int(1.05 * size)):

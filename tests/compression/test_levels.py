@@ -55,7 +55,7 @@ def manifest_of(folder: Path) -> dict:
     return json.loads((folder / "lod.json").read_text("utf-8"), parse_constant=refuse)
 
 
-def test_every_level_has_exactly_as_many_gaussians_as_asked_for_the_finest_first(scene, levels):
+def test_levels_have_the_counts_that_were_asked_for_the_finest_first(scene, levels):
     assert [len(level.scene) for level in levels] == [200, 100, 40, 12]
     assert [len(s) for s in levels.scenes] == [200, 100, 40, 12] and len(levels) == 4
     assert all(level.scene.sh_degree == scene.sh_degree for level in levels)
@@ -137,9 +137,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("where", [(DenseReference, "closeness"), (level_folder, "write_ply"), (level_folder, "_draw")])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
-def test_levels_that_fail_or_are_interrupted_leave_nothing_and_what_was_there_stays(
-    where, error, scene, views, tmp_path, monkeypatch
-):
+def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scene, views, tmp_path, monkeypatch):
     def failing(*_, **__):
         raise error("now")
 
@@ -208,7 +206,7 @@ def test_levels_that_fit_no_scene_are_refused_before_one_is_read(asked, message)
         (["50%", "10%", 200], "levels 50% and 200 both mean 200"),
     ],
 )
-def test_levels_that_do_not_fit_the_scene_are_refused_and_nothing_is_written(asked, message, scene, tmp_path):
+def test_levels_that_do_not_fit_are_refused_and_nothing_is_written(asked, message, scene, tmp_path):
     with pytest.raises(ps.BudgetError, match=message):
         ps.lod(scene, asked, folder=tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -26,6 +26,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D
+from quick_looking import USUAL, looking
 
 CPU = torch.device("cpu")
 
@@ -87,7 +88,8 @@ def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pru
         photo if index % 8 else photo._replace(target=photo.target.lerp(known_render, known))
         for index, (photo, known_render) in enumerate(zip(photos, renders, strict=True))
     ]
-    trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
+    with looking(USUAL):
+        trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
     assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
     if kept:
         assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.2

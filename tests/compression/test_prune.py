@@ -60,7 +60,7 @@ def test_a_score_that_looks_at_the_scene_is_computed_once_and_chooses(by, scene,
     assert same(result.scene, scene[select(method.score(scene, views), len(result.scene))])
 
 
-def test_a_psnr_for_a_format_is_reached_by_its_rounded_scene_in_fewer_bytes(scene, views):
+def test_a_psnr_in_a_format_is_reached_by_its_rounded_scene(scene, views):
     plain, small = (pruned(scene, views, WithinPsnr(22.0, suffix), "coverage").scene for suffix in (".ply", ".spz"))
     assert len(encode_spz(small)) < len(encode_spz(plain))
     assert DenseReference(scene, views).psnr(small)[0] >= 22.0

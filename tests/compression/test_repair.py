@@ -17,6 +17,7 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
+from quick_looking import USUAL, looking
 
 
 @pytest.fixture(autouse=True)
@@ -51,9 +52,10 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     """In a room that the network was not trained on, and in views that no step has seen."""
     monkeypatch.setitem(STEPS, "quick", 6)
     room = example_room()
-    pruned = prune(room, 0.1, "merge")
-    reference = DenseReference(room, sample_views(room, 6, 160, 120, seed=99))
-    source = ViewSource(room, given=sample_views(room, 32, 160, 120, seed=98))
+    with looking(USUAL):
+        pruned = prune(room, 0.1, "merge")
+        reference = DenseReference(room, sample_views(room, 6, 160, 120, seed=99))
+        source = ViewSource(room, given=sample_views(room, 32, 160, 120, seed=98))
     learned, plain = (
         repair(pruned, room, source, RepairBudget("quick"), network=network).scene for network in ("shipped", None)
     )
@@ -131,7 +133,7 @@ def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_
     assert len(set(taken[1::2])) == 16 and not set(taken[1::2]) & (left | compared)
 
 
-def test_where_few_views_are_given_others_are_sampled_with_what_lies_behind(hollow_ball):
+def test_views_sampled_beside_few_given_ones_have_their_background(hollow_ball):
     few = sample_views(hollow_ball, 3, 48, 36)
     white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
     taken = list(itertools.islice(ViewSource(hollow_ball, given=white).others(), 40))

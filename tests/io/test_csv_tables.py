@@ -26,7 +26,7 @@ def test_the_table_of_a_folder_holds_no_formula_of_a_file_name(tmp_path):
         assert [row["name"] for row in csv.DictReader(stream)] == [f"'{name}"]
 
 
-def test_links_among_the_tables_of_a_folder_are_replaced_and_not_written_through(tmp_path):
+def test_links_among_the_tables_of_a_folder_are_not_written_through(tmp_path):
     ps.save(normal_scene(4), tmp_path / "in" / "a.ply")
     (tmp_path / "diary.txt").write_text("precious")
     (tmp_path / "out").mkdir()

@@ -123,7 +123,7 @@ def test_what_is_not_there_is_one_error(tmp_path, name):
 POINTS = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
 
 
-def test_files_and_the_newest_run_of_each_experiment_are_scenes_and_nothing_else_is(make_run, tmp_path, caplog):
+def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, tmp_path, caplog):
     folder = tmp_path / "outputs"
     make_run("kitchen", time="2024-05-06_070809", steps=(9,))
     newest = make_run("kitchen", method="splatfacto-cpu", time="2025-05-06_070809", steps=(19,))

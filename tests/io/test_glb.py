@@ -159,11 +159,6 @@ def test_of_impossible_nodes_is_one_error(tmp_path, nodes, said):
         ps.load(with_nodes(tmp_path / "a.glb", nodes))
 
 
-def test_of_several_meshes_is_one_scene(tmp_path):
-    (tmp_path / "a.glb").write_bytes(glb_of(small_integers()))
-    assert len(ps.load(with_nodes(tmp_path / "a.glb", [], 2))) == 6
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -161,7 +161,7 @@ def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog
     assert after > cut_apart + 6  # 12 dB in a whole room
 
 
-def test_compressed_ply_names_colours_that_widen_the_bounds_of_their_chunks(tmp_path, caplog):
+def test_compressed_ply_names_colours_that_widen_their_chunks(tmp_path, caplog):
     psnr_of_file(with_dark(room(), lobes=True), tmp_path / "a.compressed.ply")
     assert "of the colours are rounded to 0.02" in loss_text(caplog)
 

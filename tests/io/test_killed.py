@@ -137,7 +137,7 @@ def write_old(kind: str, out: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS["killed"])
-def test_killed_at_any_operation_on_files_a_writer_leaves_the_old_file_or_the_new_one(kind, work):
+def test_a_killed_writer_leaves_the_old_file_or_the_new_one(kind, work):
     before = shown(work / "killed" / kind / "before")
     kills = sorted((work / "killed" / kind).glob("after-*"), key=lambda path: int(path.name[6:]))
     assert len(kills) > 3
@@ -156,7 +156,7 @@ def test_killed_at_any_operation_on_files_a_writer_leaves_the_old_file_or_the_ne
 
 
 @pytest.mark.parametrize("kind", KINDS["full"])
-def test_a_file_that_grows_beyond_what_may_be_written_is_one_error_and_the_old_one_stays(kind, work):
+def test_a_file_beyond_the_size_limit_is_one_error_and_the_old_stays(kind, work):
     place = work / "full" / kind
     said = (place / "said.txt").read_text()
     assert said.startswith(f"SceneError: {place / 'out'}") and "it needs more than 0.700 kB" in said

@@ -73,7 +73,7 @@ def test_doubles_near_the_origin_get_no_offset(tmp_path):
     assert back.offset is None and np.allclose(absolute(back), scene.means.numpy() + [0, 0, 3], atol=1e-6)
 
 
-def test_a_render_of_a_geo_referenced_scene_is_that_of_the_scene_at_its_origin(tmp_path):
+def test_a_geo_referenced_scene_is_drawn_as_at_its_origin(tmp_path):
     scene = ball(3000, log_size=math.log(0.06))
     with_doubles(scene, tmp_path / "a.ply")
     back, views = ps.load(tmp_path / "a.ply"), ps.sample_views(scene, 2, width=96, height=64)
@@ -230,7 +230,7 @@ def test_two_scenes_are_filmed_in_the_frame_of_the_first(tmp_path):
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
 
-def test_a_ply_that_is_pruned_in_parts_keeps_its_offset_and_takes_poses_of_its_frame(tmp_path):
+def test_a_ply_that_is_pruned_in_parts_keeps_its_offset(tmp_path):
     with_doubles(ball(4000, log_size=math.log(0.1)), tmp_path / "a.ply")
     main(["prune", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.ply"), "--keep", "50%", "--memory", "4GB"])
     whole, small = ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply")

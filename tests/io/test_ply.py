@@ -140,7 +140,7 @@ def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
     ids=["a comment", "an element that follows"],
 )
 @pytest.mark.parametrize("text", [False, True])
-def test_comments_in_any_encoding_and_what_follows_the_gaussians_are_passed_over(tmp_path, text, before, inserted):
+def test_comments_in_any_encoding_and_later_elements_are_skipped(tmp_path, text, before, inserted):
     scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "b.ply", rows_of(tmp_path / "a.ply"), text=text, byte_order="<")
@@ -148,7 +148,7 @@ def test_comments_in_any_encoding_and_what_follows_the_gaussians_are_passed_over
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
 
 
-def test_lists_before_the_gaussians_are_passed_over_in_ascii_and_refused_in_binary(tmp_path):
+def test_lists_before_the_gaussians_are_skipped_in_ascii_alone(tmp_path):
     scene = normal_scene(5, 0)
     write_ply(scene, tmp_path / "a.ply")
     faces = PlyElement.describe(np.array([([1, 2, 3],), ([4],)], [("vertex_indices", "O")]), "face")

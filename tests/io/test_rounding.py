@@ -195,7 +195,7 @@ def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
 
 
 @pytest.mark.parametrize("different", [1, 300, 700])
-def test_sh_of_few_different_rows_as_in_files_that_have_a_palette_already_keep_them(different):
+def test_sh_of_few_different_rows_keep_them(different):
     """A palette of twice the entries may then have no error at all."""
     rows = 3 * rows_of(different, 9)[torch.arange(4000) % different].reshape(4000, 3, 3)
     rounding = rounding_for(30.0, 1)

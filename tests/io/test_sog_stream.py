@@ -164,7 +164,7 @@ HEAD = struct.Struct("<4sIIBBBB")
 
 @given(count=st.integers(0, 2**32 - 1), degree=st.integers(0, 255), bits=st.integers(0, 255), version=st.integers(2, 4))
 @QUICK
-def test_headers_of_spz_that_do_not_fit_what_follows_are_refused_or_read_as_far(tmp_path, count, degree, bits, version):
+def test_spz_headers_that_do_not_fit_their_data_are_refused(tmp_path, count, degree, bits, version):
     data = bytearray(encode_spz(ps.example_room()[:3], version=4))
     data[: HEAD.size] = HEAD.pack(b"NGSP", version, count, degree, bits, 0, data[15])
     (tmp_path / "a.spz").write_bytes(data)

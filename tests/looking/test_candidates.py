@@ -60,7 +60,7 @@ def test_the_likelihood_is_that_of_its_formula():
         assert float(shown[row].sum()) + 1 == pytest.approx(share * len(scene))
 
 
-def test_views_of_much_are_likelier_than_of_little_of_holes_or_of_what_is_near():
+def test_views_of_much_are_likelier_than_of_holes_or_of_what_is_near():
     found = candidates(wall())
     good, hole, close, away = found.judged(seen_from((0, -1, 0), (4, -1, 0), (0, 1.9, 0), (0, 3, 0)))[0].tolist()
     assert good > max(hole, close, away) + 1
@@ -77,7 +77,7 @@ def test_evidence_of_sh_counts_where_there_are_sh():
     torch.testing.assert_close(added, EVIDENCE_WEIGHT * found.evidence.at(eyes).double())
 
 
-def test_the_next_view_shows_what_earlier_ones_do_not_and_unlikely_ones_come_last():
+def test_the_next_view_shows_what_earlier_ones_do_not():
     found = candidates(wall(300))
     shown = torch.zeros(4, 300, dtype=torch.bool)
     shown[0, :150] = shown[1, :149] = True

@@ -32,11 +32,6 @@ def test_sampled_poses_are_rotations_and_show_the_scene(hollow_ball):
     assert all(render(hollow_ball, views[i]).mean() > 0.02 for i in range(12))
 
 
-def test_sampled_poses_are_those_of_their_seed(hollow_ball):
-    a, b, c = (sample_views(hollow_ball, 3, seed=seed).viewmats for seed in (1, 1, 2))
-    assert torch.equal(a, b) and not torch.equal(a, c)
-
-
 def test_an_object_is_looked_at_from_around_it(make_hollow_ball):
     generator = torch.Generator().manual_seed(3)
     blob = make_hollow_ball(400).replace(means=0.3 * torch.randn(400, 3, generator=generator))
@@ -79,7 +74,7 @@ def ground_and_post(factor=1.0):
     return scene.replace(means=scene.means * factor, scales=scene.scales + math.log(factor))
 
 
-def test_views_are_upright_and_from_above_the_floor_however_the_scene_is_turned():
+def test_views_are_upright_and_above_the_floor_for_any_turn_of_the_scene():
     turn = TURNS[1]
     views = sample_views(turned(room(), turn), 8, 64, 48)
     up = torch.from_numpy(turn.apply([0.0, 0.0, 1.0]))
@@ -100,7 +95,7 @@ def test_a_room_is_seen_whole_by_a_dozen_views():
     assert float((grey.grad[:, 0] > 0).double().mean()) > 0.95
 
 
-def test_an_object_on_the_ground_is_in_the_middle_of_the_picture_and_seen_from_all_sides():
+def test_an_object_is_in_the_middle_and_seen_from_all_sides():
     views = sample_views(ground_and_post(), 12, 64, 48)
     places = places_of(views)
     assert float(places[:, 2].min()) > 0  # above the ground

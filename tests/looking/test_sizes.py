@@ -43,7 +43,7 @@ def test_the_scene_itself_is_not_wrong_at_any_size_and_a_wider_one_is(scene, vie
     assert renders.psnr(scene) == 100.0
 
 
-def test_an_error_of_opacity_alone_counts_before_the_background_that_shows_it(scene, views):
+def test_an_error_of_opacity_alone_counts_on_some_background(scene, views):
     """Black Gaussians before black: their opacity does not show, and it does before white."""
     black = scene.replace(features_dc=torch.full_like(scene.features_dc, -10.0), features_rest=scene.features_rest * 0)
     renders = RendersOfSizes(black, views, sides_of(640, 480))

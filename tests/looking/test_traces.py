@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from making import EYES, ball, box_room, normal_scene, photographed
+from making import EYES, ball, box_room, normal_scene, photographed, run_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
@@ -180,11 +180,6 @@ def scene() -> Gaussians:
     return ball(400)
 
 
-def run_of(trained_walls: Path, name: str) -> Path:
-    (run,) = (trained_walls / name / "splatfacto-cpu").iterdir()
-    return run
-
-
 def test_a_run_is_looked_at_from_its_own_poses(scene, trained_walls):
     source = ViewSource(scene, run=run_of(trained_walls, "wall-b"), dataset_views=dataset_views)
     views = source.views(4)
@@ -213,14 +208,14 @@ def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses(scene, trained
     assert source.origin == f"sampled poses, up is {source.up} (no dataset: its data is not there)"
 
 
-def test_a_run_whose_data_is_gone_and_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
+def test_a_run_without_data_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
     nothing = ViewSource(scene[:0], run=run_of(trained_walls, "wall-a"), dataset_views=data_is_gone)
     with pytest.raises(DataError, match="nothing of the scene can be seen"):
         nothing.views(2)
     assert nothing.origin == ""
 
 
-def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_given_ones(scene):
+def test_a_resolution_is_that_of_sampled_views_and_bounds_given_ones(scene):
     asked = ViewSource(scene, resolution=(96, 54)).views(2)
     assert (asked.width, asked.height) == (96, 54)
     given = sample_views(scene, 2, 900, 600)
@@ -228,13 +223,13 @@ def test_a_resolution_that_is_asked_for_is_that_of_sampled_views_and_bounds_give
     assert next(ViewSource(scene, given=given, resolution=(300, 200)).others()).width == 300
 
 
-def test_a_scene_without_known_views_is_repaired_before_another_background_as_well(scene):
+def test_a_scene_without_known_views_is_repaired_on_two_backgrounds(scene):
     views = ViewSource(scene, resolution=(64, 48)).others()
     behind = [next(views).background.tolist() for _ in range(10)]
     assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8
 
 
-def test_views_that_are_sampled_beside_too_few_known_ones_are_drawn_as_these_are(scene):
+def test_views_sampled_beside_few_known_ones_have_their_mode(scene):
     given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
     assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
 

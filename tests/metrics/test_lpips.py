@@ -130,7 +130,7 @@ def test_other_types_are_compared_in_float32(alex):
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net, tmp_path):
+def test_the_smallest_image_works_and_smaller_ones_are_refused(net, tmp_path):
     torch.save(random_backbone(net), tmp_path / "b.pth")
     model, least = load_lpips(net, tmp_path / "b.pth"), {"alex": 31, "vgg": 16}[net]
     assert model(*pair(least, least + 5)).isfinite()
@@ -138,9 +138,6 @@ def test_the_smallest_image_works_and_one_below_or_of_another_shape_is_said(net,
         model(*pair(least - 1, least))
     with pytest.raises(ImageError, match=r"pred has shape \(3, 40, 40\)"):
         model(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
-
-
-# Loaded once
 
 
 @pytest.fixture
@@ -151,9 +148,6 @@ def clock(monkeypatch):
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._failures", failures)
     monkeypatch.setattr("pointsplat_ns.metrics.lpips._loaded", cachetools.LRUCache(4))
     return now
-
-
-# In a report
 
 
 def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, clock, monkeypatch):

@@ -41,7 +41,7 @@ def views() -> Views:
     return views_of_cameras(some_cameras(), BACKGROUND, "antialiased")
 
 
-def test_a_view_sees_a_point_at_the_pixel_where_nerfstudios_ray_to_it_starts(views):
+def test_a_view_sees_a_point_at_the_pixel_of_nerfstudios_ray(views):
     cameras = some_cameras()
     at = torch.tensor([12.5, 31.5])  # row and column, at pixel centres as nerfstudio counts
     rays = cameras.generate_rays(torch.tensor([[1]]), coords=at[None])

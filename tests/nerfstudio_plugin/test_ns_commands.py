@@ -233,7 +233,7 @@ def test_interpolate_and_spiral_move(way, options, count, apart, run: Run, tmp_p
     assert len(pictures) == count and np.abs(pictures[0] - pictures[count // 2 - 1]).mean() > apart
 
 
-def test_dataset_puts_beside_each_render_the_photo_as_its_camera_would_have_taken_it(run: Run, tmp_path):
+def test_dataset_puts_the_undistorted_photo_beside_each_render(run: Run, tmp_path):
     words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
     started(render, "dataset", *words, "--split", "train+test", "--rendered-output-names", "rgb", "gt-rgb", "depth")
     _, pipeline, _, _ = eval_setup(run.config, test_mode="test")

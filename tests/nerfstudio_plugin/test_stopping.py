@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 
 from making import small_config
@@ -57,16 +56,6 @@ def test_a_folder_that_cannot_be_made_is_one_error(method, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(PointSplatError, match="file/room.*: cannot be made .* name another --output-dir"):
         config_of(method, tmp_path / "file").save_config()
-
-
-def test_two_trainings_of_one_timestamp_leave_two_results(wall_scene, wall_config, run_training, tmp_path):
-    configs = [wall_config(wall_scene, tmp_path, steps) for steps in (2, 3)]
-    configs[1].timestamp = configs[0].timestamp
-    trainers = [run_training(config)[0] for config in configs]
-    for trainer, config, steps in zip(trainers, configs, (2, 3), strict=True):
-        (path,) = config.get_checkpoint_dir().iterdir()
-        assert path.parent == trainer.checkpoint_dir
-        assert torch.load(path, weights_only=True)["step"] == steps - 1
 
 
 @pytest.mark.parametrize("resumed", [False, True])

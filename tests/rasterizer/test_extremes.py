@@ -141,23 +141,23 @@ def test_degenerate_gaussians(case, mode):
     # (with axes of 1e20 pixels the reference's xx yy - xy^2 cancels to 0 even in float64)
 
 
-@pytest.mark.parametrize("compiled", [None, False])
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("axes", [1, 2, 3])
-def test_gradients_are_right_for_any_size_that_float32_holds(axes, mode, compiled):
+def test_gradients_are_right_for_any_size_that_float32_holds(axes, mode):
     view, K = (t.float().double() for t in camera_askew())
-    for log_scale, opacity in itertools.product((0.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 88.7), (0.02, 0.3, 0.99)):
+    for log_scale, opacity in itertools.product((0.0, 15.0, 20.0, 40.0, 88.7), (0.02, 0.99)):
         scene = make_scene(5)
         scene[2][:, :axes], scene[3][:] = math.exp(log_scale), opacity
         scene = [t.float().double() for t in scene]
-        single, single_grads = draw(scene, view, K, (37, 29), torch.float32, mode=mode, compiled=compiled)
         double, double_grads = draw(scene, view, K, (37, 29), F64, mode=mode)
-        assert (single - double).abs().max() <= 1e-5, log_scale  # as in check()
-        pairs = [relative_change(scene, grads) for grads in (single_grads, double_grads)]
+        wanted = relative_change(scene, double_grads)
         # What is flat over the image does not change with its size: that gradient is 1e-9 of the largest and less.
-        largest = max(float(want.norm()) for want in pairs[1])
-        for name, got, want in zip(NAMES, *pairs, strict=True):
-            assert (got - want).norm() <= 5e-6 * largest, (name, log_scale, opacity)
+        largest = max(float(want.norm()) for want in wanted)
+        for compiled in (None, False):
+            single, single_grads = draw(scene, view, K, (37, 29), torch.float32, mode=mode, compiled=compiled)
+            assert (single - double).abs().max() <= 1e-5, (log_scale, compiled)  # as in check()
+            for name, got, want in zip(NAMES, relative_change(scene, single_grads), wanted, strict=True):
+                assert (got - want).norm() <= 5e-6 * largest, (name, log_scale, opacity, compiled)
 
 
 def _with(name, value):
@@ -266,7 +266,7 @@ VIEWED = {
     },
     **{
         f"{w} x {h} pixels": (_larger(4), {"cx": w / 2, "cy": h / 2, "focal": max(20.0, 0.6 * max(w, h))}, (w, h))
-        for w, h in ((1, 1), (1, 4000), (4000, 1), (61, 53))
+        for w, h in ((1, 1), (1, 1500), (1500, 1), (61, 53))
     },
 }
 """What changes scene and view, arguments of the camera, and the size of the image."""
@@ -280,7 +280,7 @@ def test_places_and_lenses_of_the_camera(case):
     check(scene, (view, K), size)
 
 
-def test_views_in_float64_place_the_camera_exactly_and_any_unit_of_length_is_drawn():
+def test_views_in_float64_place_the_camera_exactly_in_any_unit():
     means, quats, scales, opacities, sh = make_scene(50)
     scene = Gaussians(means, scales.log(), quats, torch.logit(opacities)[:, None], sh[:, 0], sh[:, 1:])
     view, K = camera_askew()

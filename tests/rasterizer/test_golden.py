@@ -71,7 +71,7 @@ def test_quality_is_handed_on(room, views):
     assert 30 < psnr < 60, "nearly the same, and not the same"
 
 
-def test_a_camera_is_on_the_cpu_in_float64_whatever_the_scene_and_the_view_are(room, views, monkeypatch):
+def test_cameras_are_on_the_cpu_in_float64_for_any_scene_and_view(room, views, monkeypatch):
     given = []
 
     def recorded(centre_of):
@@ -81,8 +81,8 @@ def test_a_camera_is_on_the_cpu_in_float64_whatever_the_scene_and_the_view_are(r
     for dtype in (torch.float32, torch.float64):
         view = dataclasses.replace(views[0], viewmat=views[0].viewmat.to(dtype), K=views[0].K.to(dtype))
         with pretend_gpu():
-            project_scene(room.to(GPU), view)
-            project_scene(room.to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
+            project_scene(room[:20].to(GPU), view)
+            project_scene(room[:20].to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
     assert len(given) == 4
     assert all((viewmat.device.type, viewmat.dtype) == ("cpu", torch.float64) for viewmat in given)
 
@@ -106,9 +106,7 @@ def test_pixels_of_gaussians_are_sums_of_their_weights(room, views, dtype, compi
         torch.testing.assert_close(pixels, wanted, rtol=tolerance, atol=tolerance)
 
 
-def test_pixels_are_the_same_on_any_threads_and_to_rounding_where_pairs_are_too_many_for_one_pass(
-    room, views, monkeypatch
-):
+def test_pixels_are_the_same_on_any_threads_and_in_several_passes(room, views, monkeypatch):
     whole = pixels_of(room, views[0])
     assert_same_on_any_threads(lambda: [pixels_of(room, view) for view in views])
     monkeypatch.setattr(scene_module, "MOST_PAIRS", 3000)

@@ -131,7 +131,7 @@ def test_pictures_are_the_same_on_any_threads():
 
 @needs_compiler
 @torch.no_grad()
-def test_long_lists_of_a_tile_are_in_the_order_of_depth_and_equal_depths_in_that_of_gaussians():
+def test_long_lists_of_a_tile_are_in_the_order_of_depth_then_row():
     count = 2000
     g = torch.Generator().manual_seed(4)
     scene = normal_scene(count, 0, seed=4)
@@ -149,7 +149,7 @@ def test_long_lists_of_a_tile_are_in_the_order_of_depth_and_equal_depths_in_that
 
 
 @needs_compiler
-def test_a_scene_with_gradients_and_other_precisions_are_left_to_the_general_way():
+def test_gradients_and_other_precisions_are_left_to_the_general_way():
     scene, view = scene_of(1, 50), view_of()
     leaf = scene.replace(features_dc=scene.features_dc.clone().requires_grad_())
     assert not pictures.can_draw(leaf, None) and not pictures.can_draw(scene.to(torch.float64), None)

@@ -95,7 +95,7 @@ def test_colours_and_their_gradients_are_gsplats(degree, stored):
 
 
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 1.0])
-def test_what_ends_a_thousandth_beside_the_outer_pixel_centres_is_left_out_and_what_reaches_them_is_not(opacity):
+def test_only_what_reaches_the_outer_pixel_centres_is_seen(opacity):
     # Points, which the low-pass of 0.3 pixels^2 makes discs; alpha is 1/255 at this distance from their centres.
     reach = math.sqrt(2 * 0.3 * math.log(255 * opacity))
     w, h, focal = 37, 29, 40.0

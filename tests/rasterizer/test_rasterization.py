@@ -29,9 +29,9 @@ def both(scene, camera, mode="classic", sh_degree=3):
     "n,scale,opacity,size",
     [
         (2, -0.5, 1.0, (16, 16)),
-        (200, -3.0, 1.0, (37, 29)),
-        (150, -1.0, 0.3, (23, 8)),  # large and faint: every tile sees every Gaussian
-        (150, -1.0, 1.0, (9, 31)),  # large and opaque: pixels saturate and stop
+        (90, -3.0, 1.0, (29, 22)),
+        (60, -1.0, 0.3, (19, 8)),  # large and faint: every tile sees every Gaussian
+        (60, -1.0, 1.0, (9, 23)),  # large and opaque: pixels saturate and stop
     ],
 )
 def test_image_and_gradients_equal_the_reference_in_float64(mode, n, scale, opacity, size):
@@ -70,7 +70,7 @@ def test_gradcheck():
 
     # all pixels see all Gaussians far above the 1/255 threshold, where the image is smooth
     assert (render(*scene, background)[1] > 0.05).all()
-    assert torch.autograd.gradcheck(render, (*scene, background), eps=1e-6, atol=1e-5)
+    assert torch.autograd.gradcheck(render, (*scene, background), eps=1e-6, atol=1e-5, fast_mode=True)
 
 
 def test_batched_cameras_equal_one_at_a_time_packed_or_not():

@@ -54,7 +54,7 @@ def test_patches_attend_within_themselves_and_the_last_borrows_from_before():
     assert torch.allclose(module(x, (order, order.argsort()))[order], expected, atol=1e-12)
 
 
-def test_convolution_gives_points_of_one_cell_the_convolution_of_their_mean():
+def test_points_of_a_cell_get_the_convolution_of_their_mean():
     config = preset("full", grid=4)
     means = torch.rand(40, 3, generator=seeded())
     structure = structure_of(means, config)

@@ -110,7 +110,7 @@ def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes
 
 
 @pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
-def test_a_few_steps_fit_a_target_that_depends_on_neighbours_and_evaluation_agrees(norm):
+def test_a_few_steps_fit_a_target_that_depends_on_neighbours(norm):
     scene = scene_to_refine(300, sh_degree=1)
     near = torch.cdist(scene.means, scene.means).topk(4, largest=False).indices
     target = scene.features_dc[near].mean(dim=1)
@@ -191,7 +191,7 @@ def hard_scenes() -> dict[str, Gaussians]:
 
 
 @pytest.mark.parametrize("name", hard_scenes())
-def test_an_untrained_refiner_returns_hard_scenes_to_the_bit_but_zero_quaternions(name):
+def test_an_untrained_refiner_returns_hard_scenes_to_the_bit(name):
     scene = hard_scenes()[name]
     refined = small_refiner(trained=False)(scene)
     zero = (scene.quats == 0).all(dim=1)
@@ -230,12 +230,9 @@ def assert_finite(refiner: Refiner, scene: Gaussians, name: str) -> None:
     assert refiner.heads.mlps["features_dc"][-1].bias.grad.abs().max() > 0, name
 
 
-"""The published grid, stages, strides, heads and patches, in fewer channels and blocks for the sake of time."""
-
-
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_dc", "features_rest"])
-def test_unusable_gaussians_come_back_unchanged_and_the_others_as_if_those_were_not_there(name, bad):
+def test_unusable_gaussians_come_back_unchanged_and_change_no_others(name, bad):
     scene = scene_to_refine(60)
     bad_rows = torch.tensor([0, 17, 59])
     getattr(scene, name)[bad_rows] = bad
@@ -258,7 +255,7 @@ def test_a_scene_of_unusable_gaussians_alone_comes_back():
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-def test_what_a_broken_network_computes_never_leaves_it_in_evaluation_but_shows_in_training(bad):
+def test_a_broken_network_changes_nothing_except_in_training(bad):
     scene = scene_to_refine(60)
     refiner = small_refiner()
     with torch.no_grad():

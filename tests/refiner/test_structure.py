@@ -14,7 +14,7 @@ from pointsplat_ns.refiner.config import FINE_BITS
 from pointsplat_ns.refiner.encoder import DualBranchEncoder
 from pointsplat_ns.refiner.normalize import gaussian_features, unit_cube
 from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
-from pointsplat_ns.refiner.structure import HALF_KERNEL, STRUCTURE, StructureSettings, build_structure, neighbour_pairs
+from pointsplat_ns.refiner.structure import STRUCTURE, StructureSettings, build_structure, neighbour_pairs
 
 
 def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
@@ -77,7 +77,7 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
 
 
 @pytest.mark.parametrize("spread", [1, 3, 100, 2**16 - 1])
-def test_looking_up_and_searching_find_the_pairs_that_brute_force_finds_in_order(spread, monkeypatch):
+def test_neighbour_pairs_are_those_of_brute_force_in_order(spread, monkeypatch):
     g = torch.Generator().manual_seed(4)
     cells = torch.cat([torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])])
     cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(0, spread)
@@ -122,13 +122,7 @@ def grid_cells(side: int) -> torch.Tensor:
     return torch.tensor(list(itertools.product(range(side), repeat=3)))
 
 
-def test_half_kernel_and_its_mirror_are_the_26_neighbours_in_tap_order():
-    taps = list(itertools.product((-1, 0, 1), repeat=3))
-    assert HALF_KERNEL == taps[14:]
-    assert [tuple(-d for d in offset) for offset in HALF_KERNEL] == taps[12::-1]
-
-
-def test_submanifold_convolution_on_scattered_cells_equals_dense_with_zeros_elsewhere():
+def test_submanifold_convolution_equals_dense_with_zeros_elsewhere():
     side, cin, cout = 8, 2, 3
     cells = grid_cells(side)[torch.randperm(side**3, generator=seeded())[:90]]
     x = torch.randn(90, cin, dtype=torch.float64, generator=seeded(1))
@@ -165,7 +159,7 @@ def test_segments_are_reduced_as_by_a_loop_and_pass_gradcheck(segment, reduce):
 
 
 @pytest.mark.parametrize("size", ["tiny", "small"])
-def test_the_refiner_gives_the_same_scene_and_gradients_whatever_goes_at_once(size, monkeypatch):
+def test_the_refiner_gives_the_same_in_pieces_of_any_size(size, monkeypatch):
     scene = normal_scene(700, dtype=torch.float64)
     torch.manual_seed(0)
     refiner = move_zero_layers(Refiner(preset(size, patch=100)).double())

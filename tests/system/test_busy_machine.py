@@ -116,9 +116,7 @@ def test_the_machine_is_looked_at_once_a_second_and_the_number_follows(machine):
     ("quota", "in_group", "on_machine", "threads"),
     [(4.0, 0.0, 40.0, 4), (4.0, 3.0, 40.0, 1), (4.0, 0.0, 62.0, 2), (2.5, 0.0, 0.0, 2), (100.0, 0.0, 10.0, 54)],
 )
-def test_in_a_container_its_own_load_counts_and_the_hosts_only_where_it_is_full(
-    machine, quota, in_group, on_machine, threads
-):
+def test_in_a_container_the_hosts_load_counts_only_where_it_is_full(machine, quota, in_group, on_machine, threads):
     machine.count, machine.quotas, machine.others_use = 64, [(quota, in_group)], on_machine
     torch.set_num_threads(64)
     assert used() == threads
@@ -151,7 +149,7 @@ def test_time_that_a_control_group_has_used_is_read_in_seconds(tmp_path):
     assert cores_module._seconds_of(tmp_path) == 1.5
 
 
-def test_the_callers_threads_are_restored_also_after_an_error_and_nothing_is_said(machine, caplog):
+def test_the_callers_threads_are_restored_also_after_an_error(machine, caplog):
     machine.others_use = 13.0
     with pytest.raises(KeyboardInterrupt), suitable_threads():
         assert torch.get_num_threads() == 3

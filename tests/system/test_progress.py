@@ -41,7 +41,7 @@ def read_until(stream: io.StringIO, text: str) -> str:
     return stream.getvalue()
 
 
-def test_a_log_gets_a_plain_line_from_time_to_time_also_while_nothing_is_reported(stderr, monkeypatch):
+def test_a_log_gets_a_plain_line_from_time_to_time(stderr, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
     log = stderr(io.StringIO())
     with progress_bar() as report:

@@ -26,6 +26,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ra
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.system.processes import average_gradients, gathered
+from quick_looking import QUICK, looking
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -170,7 +171,7 @@ def together(tmp_path_factory):
     return found, alone
 
 
-def test_losses_gradients_and_weights_are_those_of_one_process_with_twice_the_batch(together):
+def test_two_processes_train_as_one_with_twice_the_batch(together):
     found, alone = together
     for key, tolerance in (("losses", 1e-5), ("psnr", 1e-5)):  # float32 sums in another order, through three updates
         assert found[0][key] == found[1][key] == pytest.approx(alone[key], rel=tolerance)
@@ -272,7 +273,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 
 if __name__ == "__main__":
     child = os.fork()  # nothing has been computed, so there are no threads yet
-    with views_sampled_once():
+    with looking(QUICK), views_sampled_once():
         work(0 if child else 1, Path(sys.argv[1]))
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

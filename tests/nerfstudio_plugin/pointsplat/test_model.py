@@ -14,7 +14,7 @@ import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA, pipeline_of, run_of, same, small_config
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
@@ -123,7 +123,7 @@ def test_every_option_of_the_model_is_read_in_a_training(trained_walls, no_lpips
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused_and_leave_no_folder(trained_walls, tmp_path, changes, message):
+def test_contradictory_settings_are_refused_and_leave_no_folder(trained_walls, tmp_path, changes, message):
     config = small_config(trained_walls, tmp_path / "outputs", 1, **changes)
     config.save_config()
     with pytest.raises(PointSplatError, match=message):
@@ -136,7 +136,7 @@ LPIPS_WEIGHTS = SHARED_DATA / "weights"
 VARIANTS = ("dense", "pruned", "refined")
 
 
-def test_a_scene_trained_again_since_is_not_the_one_that_the_network_has_seen(trained, trained_walls, tmp_path):
+def test_a_scene_that_was_trained_again_counts_as_unseen(trained, trained_walls, tmp_path):
     config, _, _ = trained
     moved = tmp_path / "moved"
     shutil.copytree(trained_walls, moved)
@@ -169,7 +169,7 @@ def report(evaluated, tmp_path_factory) -> tuple[dict, Path]:
         return evaluated.get_average_eval_image_metrics(output_path=folder, get_std=True), folder
 
 
-def test_a_report_says_of_each_scene_its_sizes_quality_speed_and_whether_it_was_trained_on(evaluated, report):
+def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
     found, folder = report
     for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
         scene, block = evaluated.model.pruned_scene(index), found["scenes"][name]

@@ -109,7 +109,7 @@ def photos_of(manager, step):
     return scene, [data["image_idx"] for _, data in frames]
 
 
-def test_a_step_gets_the_same_whatever_came_before_it_and_processes_share_it_out(trained_walls):
+def test_a_step_depends_on_its_number_alone_and_processes_share_it(trained_walls):
     one, second, other = (manager_of(trained_walls, **seed) for seed in ({}, {}, {"seed": 1}))
     alone = [photos_of(one, step) for step in range(12)]
     assert alone == [photos_of(second, step) for step in reversed(range(12))][::-1]

@@ -6,7 +6,7 @@ from unittest import mock
 import pytest
 import torch
 
-import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
+import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
 from making import dense_config, equal, pipeline_of
 from pointsplat_ns.errors import PointSplatError, SceneError

@@ -76,9 +76,7 @@ def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained
     assert losses["dense"] < 0.5 / 255 and losses["photos"] > 5 / 255
 
 
-def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken_one(
-    three_rooms, run_training, tmp_path
-):
+def test_an_interrupted_training_resumes_as_an_unbroken_one(three_rooms, run_training, tmp_path):
     stop, schedule, skipped = 4, "step", {1, 4, 6}
 
     def config(name, steps):
@@ -102,7 +100,7 @@ def test_an_interrupted_training_has_the_losses_and_skipped_steps_of_an_unbroken
     assert rates[0] == rates[1]
 
 
-def test_dropped_paths_and_shuffled_curves_are_those_of_an_unbroken_training(three_rooms):
+def test_random_choices_after_resuming_are_those_of_an_unbroken_run(three_rooms):
     pipeline = dense_config(three_rooms, Path("unused"), 1).pipeline.setup(device="cpu", test_mode="val").train()
     blocks = [m for m in pipeline.model.refiner.modules() if hasattr(m, "drop_path")]
     for block in blocks:

@@ -15,7 +15,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import pruned_key
 
 
-def test_one_network_learns_at_several_budgets_and_is_evaluated_at_the_first(trained_walls, tmp_path):
+def test_one_network_learns_at_several_budgets_and_shows_the_first(trained_walls, tmp_path):
     config = small_config(trained_walls, tmp_path, 12, more_keeps=(0.25, 40.0))
     pipeline = config.pipeline.setup(device="cpu", test_mode="val").train()
     model, cache = pipeline.model, pipeline.datamanager.cache

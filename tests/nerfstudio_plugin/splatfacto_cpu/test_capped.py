@@ -52,7 +52,7 @@ def test_opacity_and_size_are_shared_as_the_paper_has_it(opacity, copies, dtype)
     assert moves.tolist()[0] == pytest.approx([math.log(factor)] * 3, abs=5e-6 if dtype == torch.float32 else 1e-11)
 
 
-def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
+def test_noise_follows_the_covariance_and_falls_with_opacity():
     generator = torch.Generator().manual_seed(SEED)
     scales = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
@@ -70,7 +70,7 @@ def test_noise_is_the_covariance_times_normal_numbers_and_falls_with_opacity():
     assert single.dtype == torch.float32 and single.isfinite().all()
 
 
-def test_the_number_grows_by_5_percent_or_as_fast_as_needed_and_is_reached_exactly():
+def test_the_number_grows_as_fast_as_needed_and_is_reached_exactly():
     assert next_count(1000, 5000, 100) == 1050
     assert next_count(990, 1000, 100) == next_count(1000, 1000, 3) == next_count(10, 1000, 0) == 1000
     number = 10
@@ -142,9 +142,7 @@ def test_a_capped_training_that_was_cut_off_goes_on_as_if_it_had_not_been(capped
     assert equal(dict(resumed.pipeline.model.gauss_params), dict(whole.pipeline.model.gauss_params))
 
 
-def test_a_capped_training_is_the_same_on_two_threads_and_does_not_go_on_under_a_lower_cap(
-    capped_config, run_training, tmp_path
-):
+def test_a_capped_training_is_the_same_on_two_threads(capped_config, run_training, tmp_path):
     means = []
     for threads in (1, 2):
         config = capped_config(tmp_path / str(threads), 22, 400)
@@ -171,7 +169,7 @@ def test_random_points_of_a_cap_are_uniform_in_contracted_space():
     assert float(near.norm(dim=1).max()) <= 1 + 1e-5
 
 
-def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
+def test_max_gs_num_sets_the_cap_and_the_length_its_schedule():
     config = splatfacto_cpu_config()
     assert config.pipeline.model.cap is None
     assert SplatfactoCpuModelConfig(strategy="mcmc").cap == 1_000_000
@@ -186,7 +184,7 @@ def test_max_gs_num_alone_asks_for_a_cap_and_the_schedule_follows_the_length():
         _ = config.pipeline.model.cap
 
 
-def test_a_short_training_densifies_by_gradient_alone_and_a_whole_one_as_splatfacto():
+def test_a_short_training_densifies_by_gradient_alone():
     """Rates begin (30,000 / steps) ** 0.5 times higher, and the gradient of densification rises by the root of that."""
     config = splatfacto_cpu_config()
     config.max_num_iterations = 1875

@@ -75,7 +75,7 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
 
 
 @pytest.mark.parametrize("kind", [SplatfactoCpuTrainer, PointSplatTrainer])
-def test_ctrl_c_before_the_first_step_ends_nerfstudios_command_as_interrupted(kind, monkeypatch, capsys):
+def test_ctrl_c_before_the_first_step_ends_the_command_as_interrupted(kind, monkeypatch, capsys):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -90,7 +90,7 @@ def test_ctrl_c_before_the_first_step_ends_nerfstudios_command_as_interrupted(ki
     assert end.value.code == 130 and capsys.readouterr().err.endswith("interrupted\n")
 
 
-def test_a_second_signal_and_one_before_the_first_step_end_it_at_once_and_save_nothing(
+def test_a_second_or_early_signal_ends_it_at_once_and_saves_nothing(
     wall_scene, wall_config, run_training, monkeypatch, tmp_path
 ):
     config = wall_config(wall_scene, tmp_path, steps=30)
@@ -110,7 +110,7 @@ def test_a_second_signal_and_one_before_the_first_step_end_it_at_once_and_save_n
 
 
 @pytest.mark.parametrize("asked, waits", [(None, True), (signal.SIGINT, False)])
-def test_a_training_that_was_asked_to_stop_in_its_last_step_does_not_keep_its_viewer_open(asked, waits, monkeypatch):
+def test_a_training_stopped_in_its_last_step_closes_its_viewer(asked, waits, monkeypatch):
     waited = []
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda trainer: waited.append(trainer))
     trainer = object.__new__(SplatfactoCpuTrainer)
@@ -184,7 +184,7 @@ def take(trainer, steps) -> list[dict]:
 @pytest.mark.parametrize(
     ("kind", "said"), [("nan", "the main_loss is nan"), ("gradient", "the gradient of the scales is not finite")]
 )
-def test_a_step_that_is_not_finite_changes_nothing_and_is_counted_and_named(started, kind, said):
+def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, said):
     take(started, range(2))
     before = state_of(started)
     assert before["gathered"]["count"].any(), "densification has gathered something"
@@ -200,7 +200,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted_and_named(star
     assert metrics["skipped_steps"] == 1 and not equal(state_of(started)["parameters"], before["parameters"])
 
 
-def test_one_broken_photo_stops_nothing_and_too_many_steps_in_a_row_stop_and_name_it(
+def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
     wall_scene, wall_config, run_training, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(trainer_module, "MOST_SKIPPED_IN_A_ROW", 2)

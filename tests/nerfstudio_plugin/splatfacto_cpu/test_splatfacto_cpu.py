@@ -113,7 +113,7 @@ def test_crop_box_keeps_what_is_inside_and_an_empty_one_gives_background():
     assert empty["rgb"].shape == (31, 43, 3) and empty["depth"].shape == (31, 43, 1) and not empty["rgb"].any()
 
 
-def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropped():
+def test_extreme_seeds_have_finite_sizes_or_are_dropped():
     points = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e6, 0, 0], [1e6 + 1, 0, 0], [-1e18, 0, 0]])
     assert build(SplatfactoCpuModelConfig(), (points, torch.zeros(5, 3))).scales.isfinite().all()
     points, colors = random_seeds(6)
@@ -123,7 +123,7 @@ def test_extreme_seeds_have_finite_sizes_and_those_that_are_not_finite_are_dropp
         assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9, "random ones"
 
 
-def test_seeds_that_are_all_black_start_from_random_colours_that_training_can_change():
+def test_black_seeds_start_from_random_colours_that_can_be_trained():
     points, colors = random_seeds(50)
     for degree in (0, 3):
         config = SplatfactoCpuModelConfig(sh_degree=degree, background_color="black")
@@ -160,7 +160,7 @@ def test_training_lowers_the_loss_and_densifies(trained):
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
 
 
-def test_the_last_picture_and_a_viewer_that_is_still_open_do_not_draw_at_the_same_time(
+def test_the_last_picture_and_an_open_viewer_do_not_draw_at_once(
     wall_scene, wall_config, run_training, monkeypatch, tmp_path
 ):
     trainers, drawn = [], []
@@ -231,7 +231,7 @@ def test_a_checkpoint_is_whole_before_it_has_its_name(trained, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("get_std", [True, False])
-def test_what_is_not_finite_is_null_in_a_report_and_absent_from_the_training_log(trained, get_std, some_lpips):
+def test_what_is_not_finite_is_null_in_a_report_and_not_in_the_log(trained, get_std, some_lpips):
     _, trainer, _ = trained
     pipeline = trainer.pipeline
     frames = list(pipeline.datamanager.fixed_indices_eval_dataloader)[:1]

@@ -76,13 +76,14 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
 
 
 def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
-    scene = box_room(seed=3, count=12_000, size=0.08)
-    rows, k = rows_of(scene, tmp_path), 1200
-    whole, parts = merge(scene, k).scene, merged(rows, k, 3000, tmp_path, MERGING)
-    reference = DenseReference(scene, sample_views(scene, 6, width=160, height=120, seed=9))
-    assert reference.psnr(parts)[0] > reference.psnr(whole)[0] - 0.3  # other sampled views differ by as much
+    scene = box_room(seed=3, count=4000, size=0.13)
+    rows, k = rows_of(scene, tmp_path), 400
+    settings = replace(MERGING, sampled_views=8, finish_views=2, min_count_rendered=0)
+    whole, parts = merge(scene, k, settings=settings).scene, merged(rows, k, 1000, tmp_path, settings)
+    reference = DenseReference(scene, sample_views(scene, 6, width=80, height=60, seed=9))
+    assert reference.psnr(parts)[0] > reference.psnr(whole)[0] - 0.6  # as much as eight other views change
     # Density beside borders: share of the dense Gaussians near a border, and of those that remain.
-    cells = divided(rows, 3000, Scratch(tmp_path / "cells", {}), lambda share: None)
+    cells = divided(rows, 1000, Scratch(tmp_path / "cells", {}), lambda share: None)
     cell = [torch.full((count,), number) for number, count in enumerate(cells.counts)]
     dense = Gaussians.cat([cells.read(number) for number in range(len(cells))])
     near = torch.cdist(dense.means, dense.means).topk(12, largest=False).indices
@@ -111,13 +112,21 @@ from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.pruning.merging import MERGING
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.io.ply_writing import header_bytes, row_table
 from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
 here = Path(sys.argv[1])
-killed_after_steps(int(sys.argv[2]))
-rows = PlyRows.open(here / "scene.ply")
-blind = replace(MERGING, min_count_rendered=10**9)
-merge_file(rows, lambda n: 300, here / "small.ply", 1000, Scratch(here / "cells", {"a": 1}), settings=blind)
+for at in (4, 9, 0):  # as often as it is killed, it is started again
+    assert not (here / "small.ply").exists()
+    child = os.fork()
+    if child == 0:
+        killed_after_steps(at)
+        rows = PlyRows.open(here / "scene.ply")
+        blind = replace(MERGING, min_count_rendered=10**9)
+        merge_file(rows, lambda n: 300, here / "small.ply", 1000, Scratch(here / "cells", {"a": 1}), settings=blind)
+        os._exit(0)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status == (-signal.SIGKILL if at else 0), status
+    if at == 9:
+        assert len(list((here / "cells").iterdir())) > 8, "it began anew"
 """
 
 
@@ -127,18 +136,8 @@ def test_killed_and_started_again_it_goes_on_to_the_same_bytes(tmp_path):
     merged(rows, 300, 1000, tmp_path)
     wanted = (tmp_path / "small.ply").read_bytes()
     (tmp_path / "small.ply").unlink()
-    for at in (4, 9):
-        done = subprocess.run(
-            [sys.executable, "-c", KILLED_AFTER_STEPS + KILLED, str(tmp_path), str(at)], capture_output=True, text=True
-        )
-        assert done.returncode in (0, -9), done.stderr
-        if done.returncode == 0:
-            break
-        assert not (tmp_path / "small.ply").exists()
-    steps = len(list((tmp_path / "cells").iterdir()))
-    assert steps > 8  # it did not begin anew each time
     done = subprocess.run(
-        [sys.executable, "-c", KILLED_AFTER_STEPS + KILLED, str(tmp_path), "0"], capture_output=True, text=True
+        [sys.executable, "-c", KILLED_AFTER_STEPS + KILLED, str(tmp_path)], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "small.ply").read_bytes() == wanted

@@ -60,7 +60,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * torch.log10((a - b).square().mean()))
 
 
-def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit_and_so_is_a_scene_of_which_all_are_kept():
+def test_what_is_merged_with_nothing_is_unchanged_to_the_bit():
     scene = cloud(200)
     merged = merge(scene, 150)
     single = (sizes_of(merged) == 1).nonzero()[:, 0]
@@ -72,16 +72,16 @@ def test_a_gaussian_that_is_merged_with_no_other_is_unchanged_to_the_bit_and_so_
 
 
 def test_without_a_compiler_the_same_gaussians_are_merged_but_for_rounding(monkeypatch):
-    scene = ball(2500)
-    compiled = merge(scene, 400)
+    scene, settings = ball(900), replace(RENDERED, sampled_views=4, finish_views=2)
+    compiled = merge(scene, 150, settings=settings)
     monkeypatch.setattr(Kernels, "usable", lambda kernels, wanted: False)
-    by_torch = merge(scene, 400)
+    by_torch = merge(scene, 150, settings=settings)
     into = [merged.scene.means[merged.assignment] for merged in (compiled, by_torch)]
     apart = (into[0] - into[1]).norm(dim=1)
     assert compiled.finish.psnr is not None and float((apart < 1e-4).float().mean()) > 0.95
 
 
-def test_deepening_leaves_one_member_as_it_is_and_grows_with_their_number_up_to_opaque():
+def test_deepening_grows_with_the_number_of_members_up_to_opaque():
     alphas = torch.tensor([0.0, 1e-12, 0.3, 0.3, 0.3, 0.9, 1.0], dtype=torch.float64)
     counts = torch.tensor([10**6, 16, 1, 2, 16, 10**6, 10**6])
     most = ALPHA_MAX
@@ -247,7 +247,7 @@ def test_the_size_of_the_units_and_the_place_of_the_origin_do_not_matter():
         ({"min_count_rendered": 2000}, False),
     ],
 )
-def test_a_scene_is_rendered_as_soon_as_it_is_small_enough_and_not_if_it_is_turned_off(changes, rendered):
+def test_a_scene_is_rendered_once_it_is_small_enough_unless_turned_off(changes, rendered):
     merged = merge(wall(), 400, settings=replace(RENDERED, **changes))  # of 1600
     assert len(merged.scene) == 400
     assert (merged.finish.psnr is not None) == rendered and (merged.finish == Finish()) != rendered
