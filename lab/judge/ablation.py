@@ -14,6 +14,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,8 +31,9 @@ from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
 from pointsplat_ns.io.files import replacing
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.system.progress import tracked
 
 BASELINE = "default"
@@ -73,6 +76,18 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no_depth": dict(depth_exponent=0.0),
     "wide_size_changes": dict(size_changes=(-0.2, 0.0, 0.1)),
     "no_size_change_margin": dict(size_change_margin=0.0),
+    "all_positions": dict(outlier_quantiles=(0.0, 1.0)),
+    "no_max_area": dict(max_area_quantile=1.0),
+    "no_energy": dict(energy_exponent=0.0),
+    "no_flatness": dict(flatness_exponent=0.0),
+    "no_trace_factors": dict(max_log_factor=0.0),
+    "no_sh_evidence": dict(min_sh_evidence=1e9),
+    "no_min_opacity": dict(min_opacity=0.0),
+    "surface_exponent_0": dict(surface_exponent=0.0),
+    "no_photo_directions": dict(photo_direction_weight=0.0),
+    "places_evenly": dict(photo_share_exponent=0.0),
+    "candidates_4": dict(candidates_per_view=4),
+    "half_gain_coverage_1": dict(half_gain_coverage=1.0),
 }
 """For each rule the value that turns it off, or a value beside the default: fields of
 :class:`~pointsplat_ns.pruning.merging.MergeSettings`."""
@@ -122,7 +137,22 @@ def changes_of(name: str) -> dict[str, Any]:
 
 def settings_of(views: int, width: int) -> dict[str, Any]:
     """What rows depend on beside what they name themselves."""
-    return {"views": views, "width": width} | {f"merging.{name}": value for name, value in vars(MERGING).items()}
+    values = {f"merging.{name}": value for name, value in vars(MERGING).items()}
+    return {"views": views, "width": width} | values | {f"looking.{name}": v for name, v in vars(LOOKING).items()}
+
+
+@contextmanager
+def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
+    """Settings of merging with changes. Those of looking are changed while the context is open."""
+    looking = {name: value for name, value in changes.items() if name in vars(LOOKING)}
+    before = {name: getattr(LOOKING, name) for name in looking}
+    try:
+        for name, value in looking.items():
+            object.__setattr__(LOOKING, name, value)  # every module holds this one object
+        yield dataclasses.replace(MERGING, **{name: v for name, v in changes.items() if name not in looking})
+    finally:
+        for name, value in before.items():
+            object.__setattr__(LOOKING, name, value)
 
 
 def current(rows: list[Row]) -> list[Row]:
@@ -156,9 +186,9 @@ def measure(scene: JudgedScene, path: Path, tasks: list[Task], results: Results,
     warm_up()
     dense = DenseViews(scene.dense, scene.looks[0].views)
     for at, keep, name in tracked(tasks, f"{scene.name}: merged and compared", len(tasks)):
-        settings = dataclasses.replace(MERGING, **VARIANTS.get(name, {}))
         views, begin = poses if at == POSES else None, time.process_time()
-        small = merge(scene.dense, count_of(keep, len(scene.dense)), views=views, settings=settings).scene
+        with applied(VARIANTS.get(name, {})) as settings:
+            small = merge(scene.dense, count_of(keep, len(scene.dense)), views=views, settings=settings).scene
         seconds = time.process_time() - begin
         row: Row = {"scene": scene.name, "digest": scene.digest, "gaussians": len(scene.dense), "at": at, "keep": keep}
         row |= {"method": name, "changes": changes_of(name)}
@@ -185,7 +215,8 @@ def variant_table(found: pd.DataFrame, settings: dict[str, Any]) -> tuple[str, l
             still.append(str(name))
             continue
         changes = changes_of(str(name))
-        moves = (f"`{f}` {_value(settings.get(f'merging.{f}'))} to {_value(changes[f])}" for f in changes)
+        known = {name.partition(".")[2]: value for name, value in settings.items()}
+        moves = (f"`{field}` {_value(known.get(field))} to {_value(value)}" for field, value in changes.items())
         cells = []
         for keep in keeps:
             some = same.loc[same["keep"] == keep, "change"]
@@ -208,7 +239,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         lines.append([scene, f"{count:,}", where.get(at, "camera path"), group_of(scene) or "other", *cells])
     variants, still = variant_table(table_of(rows), settings)
     now = json.loads(json.dumps(settings_of(0, 0)))
-    moved = [n for n, value in now.items() if n.startswith("merging.") and settings.get(n, value) != value]
+    moved = [n for n, value in now.items() if "." in n and settings.get(n, value) != value]
     return PAGE.format(
         **{name: settings[name] for name in ("views", "width")}, little=LITTLE, variants=variants,
         scenes=markdown(["scene", "Gaussians", "views", "list", *map(percent, keeps)], lines),

@@ -115,8 +115,9 @@ def test_merging_stands_upright_in_views_that_are_sampled_for_it():
     source = ViewSource(scene, resolution=(64, 48), up=up_named("x"))
     looked = pruned(scene, source, 300).views
     assert looked is not None and (looked.width, looked.height) == (64, 48)
-    level = looked.viewmats[:, 0, :3] @ source.up.direction  # no camera is rolled about its axis
-    assert float(level.abs().max()) < 1e-6
+    steep = (looked.viewmats[:, 2, :3] @ source.up.direction).abs() > 0.99  # level has no meaning there
+    level = looked.viewmats[~steep, 0, :3] @ source.up.direction  # no camera is rolled about its axis
+    assert int(steep.sum()) <= 6 and float(level.abs().max()) < 1e-6
 
 
 @pytest.fixture(scope="module")

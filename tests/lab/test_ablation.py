@@ -6,7 +6,8 @@ from pathlib import Path
 
 from lab.judge import ablation, record, scenes
 from pointsplat_ns.io import read_scene
-from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
+from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.pruning.merging import MERGING, merge
 
 TWO = ("no_regrouping", "growth_0")
 
@@ -17,9 +18,17 @@ def rows_of(path: Path) -> list[dict]:
 
 def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
     changed = {field for found in ablation.VARIANTS.values() for field in found}
-    assert changed == {field.name for field in dataclasses.fields(MergeSettings)}
+    known = vars(MERGING) | vars(LOOKING)
+    assert vars(MERGING).keys() <= changed <= known.keys()
     for name, found in ablation.VARIANTS.items():
-        assert dataclasses.replace(MERGING, **found) != MERGING, name
+        assert any(known[field] != value for field, value in found.items()), name
+
+
+def test_settings_of_looking_are_in_force_for_their_variant_alone():
+    before = LOOKING.candidates_per_view
+    with ablation.applied({"candidates_per_view": 3, "neighbours": 2}) as settings:
+        assert LOOKING.candidates_per_view == 3 and settings == dataclasses.replace(MERGING, neighbours=2)
+    assert LOOKING.candidates_per_view == before
 
 
 def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
@@ -54,7 +63,6 @@ def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, mo
     assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
 
 
-@pytest.mark.usefixtures("usual_looking")
 def test_the_record_that_is_committed_has_the_page_of_its_rows():
     rows, settings = record.read([record.FOLDER / "ablation.json"], "ablation.py")
     assert (record.FOLDER / "ablation.md").read_text("utf-8") == ablation.page(rows, settings)

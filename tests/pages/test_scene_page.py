@@ -13,7 +13,7 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
-from making import ball, in_pictures
+from making import ball, in_pictures, views_from_within
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
@@ -146,7 +146,7 @@ def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
 
 def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     room = thinned(ps.example_room(), 3000)
-    data = FlightFrame.of(room, ps.sample_views(room, 2, 48, 36)).data([])
+    data = FlightFrame.of(room, views_from_within((0.0, 0.0, 1.3), 2, 48, 36)).data([])
     assert data["drag"] == "look" and len(data["views"]) == 2
     upside_down = look_at(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.1]]), torch.tensor([0.0, 0.0, -1.0]))
     K = torch.tensor([[[30.0, 0.0, 24.0], [0.0, 30.0, 18.0], [0.0, 0.0, 1.0]]])
