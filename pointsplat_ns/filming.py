@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
-from pointsplat_ns.compression.posed_scene import PosesFile
+from pointsplat_ns.compression.posed_scene import NO_POSES, read_found, without_poses
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import coarser_levels
@@ -97,17 +97,12 @@ def render_path(
     kind = check_output(output, force)
     need_named_data(scene, data)
     sources = [scene] if other is None else [scene, other]
-    poses = PosesFile.of(scene, views) if isinstance(views, (str, Path)) else None
-    given = views if isinstance(views, Views) else None
-    loaded = [source if isinstance(source, Gaussians) else load(source) for source in sources]
-    loaded = [one.at_offset(loaded[0].offset) for one in loaded]
-    if poses is not None:
-        poses = poses.relative_to(loaded[0].offset)
-        poses.check(loaded[0])
-        given = poses.views.resized(CAMERA_PATH.photo_side)
+    first, given = _with_views(scene, NO_POSES if views is None and path is not None else views)
+    given = None if given is None else given.resized(CAMERA_PATH.photo_side) if not isinstance(views, Views) else given
+    loaded = [first if source is scene else _loaded(source).at_offset(first.offset) for source in sources]
     if given is not None and kind == "frames" and seconds is None and path is None:
         settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))
-    view_source = _source(scene, loaded[0], given, data)
+    view_source = _source(None if without_poses(views) else scene, first, given, data)
     chosen = camera_path(loaded[0], view_source, path, settings, kind == "picture", upward)
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
@@ -121,6 +116,7 @@ def open_viewer(
     scene: Source | None = None,
     other: Source | None = None,
     *,
+    views: Views | str | Path | None = None,
     up: str | None = None,
     data: str | Path | None = None,
     host: str = "127.0.0.1",
@@ -129,12 +125,13 @@ def open_viewer(
     """Show a scene, or two scenes with the same camera, in the browser, which draws. Browsers without WebGL 2 show
     pictures that this machine's processor draws.
 
-    It opens upright, at the view that shows most of the scene, or the whole of an object.
+    It opens upright, at the known or sampled view that shows most of the scene, or at the whole of an object.
 
     Args:
         scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it. The folder
             of a stream with a page (``lod(html=True)``) alone shows that page, which the browser draws.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
+        views: known views of the first scene, as for :func:`render_path`.
         up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
         data: folder of the data of ``scene``, as for :func:`render_path`.
         host: the address to listen on; by default only this machine has access. With another address, every machine
@@ -169,19 +166,32 @@ def open_viewer(
 
     scenes: list[ViewedScene] = []
     for index, source in enumerate(source for source in (scene, other) if source is not None):
-        loaded = source if isinstance(source, Gaussians) else load(source)
+        loaded, given = (_loaded(source), None) if scenes else _with_views(source, views)
         loaded = loaded.at_offset(scenes[0].scene.offset) if scenes else loaded
+        run = None if index == 0 and without_poses(views) else source
         path = None if isinstance(source, Gaussians) else Path(source)
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
         scenes.append(
             ViewedScene(
-                _name(source, index), path, loaded, _source(source, loaded, None, None if index else data), levels
+                _name(source, index), path, loaded, _source(run, loaded, given, None if index else data), levels
             )
         )
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 
-def _source(scene: Source, loaded: Gaussians, given: Views | None, data: str | Path | None = None) -> ViewSource:
+def _loaded(scene: Source) -> Gaussians:
+    return scene if isinstance(scene, Gaussians) else load(scene)
+
+
+def _with_views(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, Views | None]:
+    """A scene, and its views if they are given, or a file of cameras is given or lies nearby."""
+    if isinstance(views, Views):
+        return _loaded(scene), views
+    loaded, found, _ = read_found(scene, views)
+    return loaded, found
+
+
+def _source(scene: Source | None, loaded: Gaussians, given: Views | None, data: str | Path | None = None) -> ViewSource:
     run = None if isinstance(scene, Gaussians) else scene
     return ViewSource(loaded, given, run, functools.partial(dataset_views, data=data))
 

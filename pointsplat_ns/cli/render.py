@@ -39,8 +39,9 @@ def render(
             scene: room.mp4 for room.ply, render.mp4 in the folder of a run. It appears when it is complete.
         path: a camera path that nerfstudio's viewer saved (.json). By default the film goes exactly through the poses;
             without poses around an object, or past what shows most of a room.
-        poses: a file of cameras, by default those of the dataset: cameras.json of 3DGS, transforms.json of nerfstudio,
-            or the folder of a COLMAP project. A folder then gets one frame for each, unless --seconds is given.
+        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP
+            project. By default one that lies beside the scene or above it, or the poses of a run's dataset; none
+            samples views instead. A folder gets one frame for each pose of a file, unless --seconds is given.
         split: layout of two scenes.
         labels: labels of two scenes; by default their names and counts. "" writes none on one.
         up: the axis that is up in the scene, for a film without poses: x, y, z, -x, -y or -z; by default the file's
