@@ -83,7 +83,7 @@ def leads(rows: list[Row]) -> pd.DataFrame:
 
 
 def lead_table(rows: list[Row]) -> None:
-    """Print the mean and the worst lead for each size, where there are files of splat-transform."""
+    """Print the mean and the smallest lead for each size, where there are files of splat-transform."""
     if not any(row["way"].startswith(PEER) for row in rows):
         return
     lines = [

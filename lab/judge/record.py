@@ -277,7 +277,7 @@ def _cost_table(figures: Figures) -> str:
 
 
 def readme_table(rows: list[Row]) -> str:
-    """The table of the README: means of all three ways, and worst leads. Small pictures are left to the record."""
+    """The table of the README: means of all three ways, and smallest leads. Small pictures are left to the record."""
     figures = Figures(rows)
     lines = []
     for at in (at for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH):
@@ -288,7 +288,7 @@ def readme_table(rows: list[Row]) -> str:
             for keep in figures.keeps
         ]
         lines.append([f"{name} ({_count(figures.scenes(at))})", *cells])
-    for method, what in (("prune", "worst lead of `prune`"), ("compact", "worst gain by `compact`")):
+    for method, what in (("prune", "smallest lead of `prune`"), ("compact", "smallest gain by `compact`")):
         leads = pd.concat({at: figures.lead(method, at, "covered_psnr") for at in figures.ats}, names=["at"])
         worst = {keep: (same.min(), same.idxmin()) for keep, same in leads.groupby("keep")}
         lines.append(

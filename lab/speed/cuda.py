@@ -144,7 +144,7 @@ class Trainings:
         return self._resumed(config, "refiner")
 
     def _resumed(self, config: Callable[[], Any], name: str) -> str:
-        """Train half of the steps, go on from the checkpoint for the others, and compare with one training of all."""
+        """Train half of the steps, resume from the checkpoint for the others, and compare with one training of all."""
         half = self.steps // 2
         first, losses = self._trained(config(), f"{name} half", half)
         rest, others = self._trained(config(), name, self.steps - half, first.checkpoint_dir)

@@ -3,7 +3,7 @@
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --downscale 1 2
     python -m lab.speed.training outputs/kitchen/splatfacto-cpu/RUN --refiner
 
-Steps of ``splatfacto-cpu`` go on from the end of a finished training whose photos are at hand, at its number of
+Steps of ``splatfacto-cpu`` continue from the end of a finished training whose photos are at hand, at its number of
 Gaussians; those of a refiner begin with a new network on that scene. They alternate between ours and ours without
 compiled kernels, so that a busy moment hits both. CPU seconds of one thread are counted, and nothing is saved.
 """

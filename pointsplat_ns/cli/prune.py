@@ -93,7 +93,7 @@ def prune(
             by default 1.
         shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
-            parts, with files beside the output; a command that was killed goes on. With --jobs each process may take
+            parts, with files beside the output; a command that was killed resumes. With --jobs each process may take
             so much.
         threads: number of threads. By default it adapts to the work and to other programs. Another number may
             change results by rounding.

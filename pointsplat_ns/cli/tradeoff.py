@@ -46,7 +46,7 @@ def tradeoff(
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
     It measures each method, SH degree and repair at each budget. Each point is saved as soon as it is measured: after
-    an interruption the same command goes on. With a target it searches for the cheapest scene that meets all targets
+    an interruption the same command resumes. With a target it searches for the cheapest scene that meets all targets
     instead, and writes it.
 
     Args:

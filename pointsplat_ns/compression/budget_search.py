@@ -257,7 +257,7 @@ def smallest_within(
     progress: Callable[[float], None] | None = None,
 ) -> FoundQuality:
     """Search for the smallest scene of a method whose renders reach ``psnr``, dB, against those of the dense scene in
-    some views; ``make`` gives the scene of a count.
+    some views; ``make(n)`` returns n Gaussians.
 
     The PSNR is that of the mean squared error of all views, so bad views count more, over the pixels that the dense
     scene covers. The result was rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not
@@ -301,7 +301,7 @@ def largest_within(
 
     Args:
         full: the largest scene.
-        make: gives the scene of a count below that of ``full``.
+        make: ``make(n)`` returns n Gaussians, fewer than ``full`` has.
         limit: of the file, without rounding.
         progress: called with the share done.
         psnr_of: gives the PSNR of a scene, dB; None where there are no views.

@@ -1,4 +1,4 @@
-"""Goes on where a repair ends: optimises a smaller scene against the photos that the dense scene was trained on.
+"""Optimises a repaired scene against the photos that the dense scene was trained on.
 
 A repair against renders of the dense scene cannot be better than these. Photos hold more. Each step takes every k-th
 pixel of a photo and a step of Adam on 0.8 L1 + 0.2 (1 - SSIM), as the training of 3DGS does. Few pixels allow many
@@ -6,8 +6,8 @@ steps. Every eighth step takes a render of the dense scene in a view that no pho
 photos show little of.
 
 Every eighth photo takes part in no step. The result is the scene that is closest to these photos and to as many others
-together. The former alone favour the scene of before, which comes from the dense one, and that was trained on them: in
-the kitchen they lose 0.2 dB where held-out photos gain 0.4. The others alone favour the scene of after.
+together. Held-out photos alone favour the original, because the dense scene was trained on them: in the kitchen they
+lose 0.2 dB where a run's own held-out photos gain 0.4. The photos of the steps alone favour the result.
 
 A few times, Gaussians are split where the loss pulls at them most, and merging makes them as many as before.
 """

@@ -150,7 +150,7 @@ def _for_psnr(
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit | None, str]:
     """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
-    scene has the PSNR when it is rounded; and a line on the search. ``make`` gives the scene of a count."""
+    scene has the PSNR when it is rounded; and a line on the search. ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 
     assert isinstance(budget, WithinPsnr)
@@ -182,7 +182,7 @@ def _for_size(
     progress: Callable[[float], None],
 ) -> tuple[Gaussians, FileLimit, str]:
     """The largest scene whose compressed file has a size, before rounding, the rounding, and a line on the search;
-    ``start`` is the largest scene allowed, ``make`` gives the scene of a count."""
+    ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, largest_within
 
     limit = FileLimit(format_to_write(budget.suffix), check_size(budget, len(dense)))

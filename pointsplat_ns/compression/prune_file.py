@@ -104,7 +104,7 @@ def prune_file(
     progress: Progress = silent,
     jobs: int = 1,
 ) -> tuple[int, float]:
-    """Merge a PLY cell by cell. A call that was killed goes on where it was, from a hidden folder beside the output.
+    """Merge a PLY cell by cell. A call that was killed resumes where it was, from a hidden folder beside the output.
 
     Args:
         rows: the scene, as of :func:`rows_to_prune`.

@@ -132,7 +132,7 @@ class PruneRequest:
         object.__setattr__(self, "budget", budget)
 
     def in_format(self, kind: Format) -> PruneRequest:
-        """The request for files of a format, which a size or a PSNR is for if ``keep`` is text that names none."""
+        """The request for files of a format. A size or a PSNR in ``keep`` that names no format is for it."""
         return replace(self, keep=parse_keep(self.keep, kind.budget_suffix)) if isinstance(self.keep, str) else self
 
     @property

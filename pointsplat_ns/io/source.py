@@ -1,4 +1,4 @@
-"""The file that a scene is read from, by what it holds: what is made of it names it, and knows it again."""
+"""Identifies the file that a scene is read from by its hash."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class Reference:
     covered: tuple[float, ...]
     """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
     alphas: list[Tensor] | None = None
-    """C alpha pictures (H, W, 1), for errors before two backgrounds; None for errors before the views' own."""
+    """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views' own."""
 
     def errors(self, scene: Gaussians) -> list[float]:
         """Mean squared error over all pixels of each view."""
@@ -116,8 +116,8 @@ class DenseReference(Reference):
         dense: N Gaussians.
         views: C views.
         both_backgrounds: errors are means over two backgrounds, the views' own and its opposite (white for black):
-            nobody knows before which one a scene is shown, and a scene that fits one may be too transparent or too
-            opaque for the other.
+            the viewer's background is unknown, and a scene that fits one may be too transparent or too opaque for the
+            other.
     """
 
     @torch.no_grad()

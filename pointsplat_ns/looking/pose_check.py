@@ -3,7 +3,7 @@
 A view that belongs to a scene shows it, and sharp: training leaves Gaussians of a few pixels where photos looked. A
 camera in a wrong frame looks past the scene, or stands in front of a few large Gaussians. Where there are photos, a
 render is more like its own photo than like the others; likeness is a correlation, so that exposure and opacity do not
-count. Wrong frames that look much like the right one (a room upside down, a smaller scale) are told by photos alone.
+count. Wrong frames that look much like the right one (a room upside down, a smaller scale) are found by photos alone.
 """
 
 from __future__ import annotations

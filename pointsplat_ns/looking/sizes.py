@@ -93,7 +93,7 @@ def two_sizes(views: Views) -> tuple[Views, Views]:
 
 class RendersOfSizes:
     """Renders of a dense scene, subsampled from pictures of several sizes, with which renders of other scenes are
-    compared before two backgrounds.
+    compared over two backgrounds.
 
     Args:
         dense: N Gaussians.

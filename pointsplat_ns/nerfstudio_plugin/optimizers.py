@@ -34,7 +34,7 @@ class FallingRateConfig(SchedulerConfig):
 
 
 class FallingRate(Scheduler):
-    """See :class:`FallingRateConfig`. Checkpoints hold the optimiser's own rate, so that a training that goes on with
+    """See :class:`FallingRateConfig`. Checkpoints hold the optimiser's own rate, so that a training that resumes with
     another length has that length's rates."""
 
     config: FallingRateConfig

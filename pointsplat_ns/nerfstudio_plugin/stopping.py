@@ -75,7 +75,7 @@ class StoppableTrainerConfig(TrainerConfig):
             CONSOLE.log(f"{given} is the folder of another training; this one gets {self.get_base_dir()}")
 
     def first_step(self) -> int:
-        """The step that a training begins with: 0, or what the name of the checkpoint says that it goes on from."""
+        """The step that a training begins with: 0, or the step in the name of the checkpoint that it resumes from."""
         if self.load_dir is None:
             return 0 if self.load_checkpoint is None else _step_after(self.load_checkpoint)
         if self.load_step is not None:
@@ -120,7 +120,7 @@ class StoppableTrainer(Trainer):
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
         if self.local_rank == 0:
-            # nerfstudio takes the steps of this call for the last step, also where a training goes on from a later one.
+            # nerfstudio takes the steps of this call for the last step, also where a training resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
         outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
         if outputs is not None:

@@ -202,7 +202,7 @@ class Viewer(Served):
         return Answer(html, "text/html; charset=utf-8")
 
     def _of_stage(self, answer: Callable[[_Stage, dict[str, Any]], Answer]) -> Callable[[Request], Answer]:
-        """A route for pages of the scenes that are shown; others are told to load again."""
+        """A route for pages of the scenes that are shown; others get an answer to load again."""
 
         def answered(request: Request) -> Answer:
             wanted, stage = json.loads(request.body.read(request.length)), self._stage

@@ -92,7 +92,7 @@ def by_first(work: Callable[[], object]) -> None:
     try:
         text = gathered([failure and (str(failure) or type(failure).__name__)])[0]
     except RuntimeError as error:  # of the connection
-        raise failure or PointSplatError("another process ended; the same command goes on") from error
+        raise failure or PointSplatError("another process ended; the same command resumes") from error
     if failure is not None:
         raise failure
     if text:

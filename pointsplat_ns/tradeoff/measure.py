@@ -62,7 +62,7 @@ def measure_tradeoff(
 
     It measures each method, SH degree and repair at each budget. Or, with targets, it searches for the cheapest scene
     that meets all of them and writes it; among limits of time and size alone, for the best one within them. Each point
-    is saved as soon as it is measured: the same call goes on after an interruption.
+    is saved as soon as it is measured: the same call resumes after an interruption.
 
     Args:
         scene: a PLY, a checkpoint, or a Splatfacto run, whose held-out photos are then used where they are found.

@@ -1,4 +1,4 @@
-"""The files of a sweep: all points as JSON, which the next call goes on from, a table, and the page."""
+"""The files of a sweep: all points as JSON, from which the next call resumes, a table, and the page."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ SWEEP_FILES = SweepFiles()
 
 
 def check_folder(folder: Path) -> None:
-    """Raise a SceneError if a folder has results without the JSON to go on from."""
+    """Raise a SceneError if a folder has results without the JSON to resume from."""
     for name in (SWEEP_FILES.table, SWEEP_FILES.page):
         if (folder / name).exists() and not (folder / SWEEP_FILES.json).exists():
             raise SceneError(
-                f"{folder / name}: exists already, without {SWEEP_FILES.json} to go on from; name another folder, or "
+                f"{folder / name}: exists already, without {SWEEP_FILES.json} to resume from; name another folder, or "
                 "overwrite it with --force"
             )
 

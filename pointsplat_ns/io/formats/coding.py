@@ -1,4 +1,4 @@
-"""What the formats share: how numbers become few bits and come back, and reading bytes that may lie."""
+"""What the formats share: how numbers become few bits and come back, and reading untrusted bytes."""
 
 from __future__ import annotations
 

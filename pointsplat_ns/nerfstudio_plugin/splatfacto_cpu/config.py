@@ -41,7 +41,7 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
 
 def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainerConfig:
     """A copy of a config with Splatfacto's 30,000-step schedules shortened to its length: ``max_num_iterations``, and
-    the steps before if it goes on from a checkpoint.
+    the steps before if it resumes from a checkpoint.
 
     Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
     at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.

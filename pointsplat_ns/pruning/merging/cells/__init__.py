@@ -6,7 +6,7 @@
    exact (``merge.py``).
 4. In each cell, members are regrouped, and their rows are written.
 
-What a step has written is kept, and a command that was killed goes on from there (``scratch.py``).
+What a step has written is kept, and a command that was killed resumes from there (``scratch.py``).
 """
 
 from pointsplat_ns.pruning.merging.cells.merge import merge_file

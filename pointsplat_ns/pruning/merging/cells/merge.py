@@ -102,7 +102,7 @@ def merge_file(
             steps = [(step, cell, *args) for cell in range(len(cells))]
             for done, (_, killed) in enumerate(workers.results(steps), 1):
                 if killed is not None:
-                    raise PointSplatError(f"{what}: {killed}; the same command goes on, with fewer --jobs if need be")
+                    raise PointSplatError(f"{what}: {killed}; the same command resumes, with fewer --jobs if need be")
                 progress(what, done / len(cells))
 
         rounds, left = 0, -1

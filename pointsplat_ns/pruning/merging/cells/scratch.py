@@ -1,4 +1,4 @@
-"""A folder of finished steps, so that work which was killed goes on."""
+"""A folder of finished steps, so that work that was killed resumes."""
 
 from __future__ import annotations
 
