@@ -186,6 +186,14 @@ def test_what_the_folder_cannot_take_is_one_line(folder, monkeypatch):
         settle(folder)
 
 
+def test_a_sparse_file_of_terabytes_fails_at_once_and_stops_no_other(folder):
+    with (folder / "huge.splat").open("wb") as stream:
+        stream.truncate(1 << 43)
+    results = settle(folder)
+    assert results["huge"].status == "failed" and "8796.1 GB of memory" in results["huge"].error
+    assert {name for name, result in results.items() if result.status != "failed"} == {"a", "b", "deep/c"}
+
+
 def test_rows_that_look_wrong_are_counted():
     scene = cloud(100, 0, 2)
     scene.means[0, 0] = math.nan
