@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
     from pointsplat_ns.compression.compact import Compacted
-    from pointsplat_ns.compression.levels import Levels
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
-    from pointsplat_ns.compression.placing import place
-    from pointsplat_ns.compression.scene_folder import SceneResult
-    from pointsplat_ns.compression.scene_info import SceneInfo, info
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.filming import open_viewer, render_path
     from pointsplat_ns.folders import compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
+    from pointsplat_ns.levels.levels import Levels
     from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.metrics import psnr, ssim
     from pointsplat_ns.metrics.lpips import lpips
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
     from pointsplat_ns.pages.scene_page import write_page
+    from pointsplat_ns.placing import place
     from pointsplat_ns.rasterizer import rasterization, render
+    from pointsplat_ns.scene_folder import SceneResult
+    from pointsplat_ns.scene_info import SceneInfo, info
     from pointsplat_ns.tradeoff.measure import measure_tradeoff
     from pointsplat_ns.tradeoff.points import Tradeoff
     from pointsplat_ns.views import View, Views
@@ -49,11 +49,11 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
     "pointsplat_ns.compression.compact": ("Compacted",),
-    "pointsplat_ns.compression.levels": ("Levels",),
+    "pointsplat_ns.levels.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
-    "pointsplat_ns.compression.placing": ("place",),
-    "pointsplat_ns.compression.scene_info": ("SceneInfo", "info"),
-    "pointsplat_ns.compression.scene_folder": ("SceneResult",),
+    "pointsplat_ns.placing": ("place",),
+    "pointsplat_ns.scene_info": ("SceneInfo", "info"),
+    "pointsplat_ns.scene_folder": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.looking.sampling": ("sample_views",),

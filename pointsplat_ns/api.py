@@ -11,9 +11,6 @@ from pathlib import Path
 
 from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
 from pointsplat_ns.compression.compact import Compacted
-from pointsplat_ns.compression.level_folder import check_level_folder
-from pointsplat_ns.compression.level_stream import Chunks, check_stream_folder
-from pointsplat_ns.compression.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (
@@ -30,6 +27,9 @@ from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
+from pointsplat_ns.levels.folder import check_level_folder
+from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
+from pointsplat_ns.levels.stream import Chunks, check_stream_folder
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page

@@ -9,18 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 from pointsplat_ns.compression.compact import compact_scene
-from pointsplat_ns.compression.placing import place
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import quality_of_pruned
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.scene_folder import (
-    Command,
-    CommandOptions,
-    SceneResult,
-    SmallerScene,
-    output_folder,
-    run_on_folder,
-)
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -29,7 +20,16 @@ from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.placing import place
 from pointsplat_ns.pruning import Keep, cut_sh
+from pointsplat_ns.scene_folder import (
+    Command,
+    CommandOptions,
+    SceneResult,
+    SmallerScene,
+    output_folder,
+    run_on_folder,
+)
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.finding import find_scene

@@ -32,8 +32,8 @@ from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.system.progress import tracked
 
 BASELINE = "default"
@@ -90,7 +90,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half_gain_coverage_1": dict(half_gain_coverage=1.0),
 }
 """For each rule the value that turns it off, or a value beside the default: fields of
-:class:`~pointsplat_ns.pruning.merging.MergeSettings`."""
+:class:`~pointsplat_ns.merging.MergeSettings`."""
 
 POSES = "photos, poses given"
 """In place of a width: the poses of held-out photos, where merging is given those of the training photos."""
@@ -111,7 +111,7 @@ rule off, or moves a setting to a value beside its default.
 - PSNR is that of [the judge](judge.md).
 - CPU is CPU seconds of merging, relative to the defaults.
 - Variants come in the order of their mean changes. `other_views` shows how much is chance.
-- Fields of `pruning/merging/settings.py` say what they do.
+- Fields of `merging/settings.py` say what they do.
 
 ## Scenes
 

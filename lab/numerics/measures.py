@@ -16,11 +16,11 @@ from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pruning.merging import MERGING, merge
-from pointsplat_ns.pruning.merging.matching import cheapest_pairs
-from pointsplat_ns.pruning.merging.pair_cost import pair_costs
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.state import initial_state
+from pointsplat_ns.merging import MERGING, merge
+from pointsplat_ns.merging.matching import cheapest_pairs
+from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.state import initial_state
 from pointsplat_ns.pruning.scores import log_volume_score, paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference

@@ -71,12 +71,12 @@ PARTS = {
     "scores": Part(
         tuple(f"pointsplat_ns/pruning/{name}" for name in _SCORES),
         ("tests/pruning/test_scores.py", "tests/pruning/test_view_scores.py"),
-        ("tests/pruning/test_[ms]*.py", _SAME_RESULT, "tests/compression/test_prune.py"),
+        ("tests/pruning/test_[ms]*.py", "tests/merging/test_merge.py", _SAME_RESULT, "tests/compression/test_prune.py"),
     ),
     "merge": Part(
-        ("pointsplat_ns/pruning/**/*.py",),
-        ("tests/pruning/merging/test_*.py",),
-        ("tests/pruning/**/test_*.py", _SAME_RESULT, "tests/compression/test_optimiser.py"),
+        ("pointsplat_ns/merging/**/*.py", "pointsplat_ns/pruning/*.py"),
+        ("tests/merging/test_*.py",),
+        ("tests/merging/test_*.py", "tests/pruning/test_*.py", _SAME_RESULT, "tests/compression/test_optimiser.py"),
         left_out=(*_SCORES, "settings.py"),
     ),
     "refiner": Part(

@@ -27,14 +27,14 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.pruning.merging import MERGING, merge
-from pointsplat_ns.pruning.merging.matching import cheapest_pairs
-from pointsplat_ns.pruning.merging.pair_cost import pair_costs
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.regrouping import Members, best_groups, group_moments
-from pointsplat_ns.pruning.merging.replacement import replace_pairs
-from pointsplat_ns.pruning.merging.state import initial_state
-from pointsplat_ns.pruning.merging.visibility import sampled_viewpoints
+from pointsplat_ns.merging import MERGING, merge
+from pointsplat_ns.merging.matching import cheapest_pairs
+from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.regrouping import Members, best_groups, group_moments
+from pointsplat_ns.merging.replacement import replace_pairs
+from pointsplat_ns.merging.state import initial_state
+from pointsplat_ns.merging.visibility import sampled_viewpoints
 from pointsplat_ns.rasterizer import pixels_of
 
 Part = Callable[[bool], object]

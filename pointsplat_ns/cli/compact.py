@@ -130,7 +130,7 @@ def compact(
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
-        from pointsplat_ns.compression.scene_folder import output_folder
+        from pointsplat_ns.scene_folder import output_folder
 
         one = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--photos": photos}
         one |= {"--dry-run": dry_run}

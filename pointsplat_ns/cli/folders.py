@@ -11,7 +11,7 @@ from pointsplat_ns.cli.printing import print_json
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.scene_folder import SceneResult
+    from pointsplat_ns.scene_folder import SceneResult
 
 
 def folder_command(

@@ -12,7 +12,7 @@ from pointsplat_ns.cli.printing import Json, print_json
 from pointsplat_ns.cli.scene_options import Data, Resolution, Up, claim_outputs
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.scene_info import SceneInfo
+    from pointsplat_ns.scene_info import SceneInfo
 
 
 def info(

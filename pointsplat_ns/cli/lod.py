@@ -23,7 +23,7 @@ from pointsplat_ns.cli.scene_options import (
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.levels import Levels
+    from pointsplat_ns.levels.levels import Levels
 
 
 def lod(
@@ -80,8 +80,8 @@ def lod(
         json_output: print the manifest, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compression.level_stream import Chunks
     from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.levels.stream import Chunks
     from pointsplat_ns.system.threads import fixed_threads
 
     need_one_scene(scene)

@@ -110,8 +110,8 @@ def prune(
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
-        from pointsplat_ns.compression.scene_folder import output_folder
         from pointsplat_ns.folders import prune_folder
+        from pointsplat_ns.scene_folder import output_folder
 
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         return folder_command(

@@ -20,7 +20,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning.merging.finishing import top_of_parabola
+from pointsplat_ns.merging.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
 
 

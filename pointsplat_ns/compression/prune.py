@@ -20,6 +20,7 @@ from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
@@ -31,7 +32,6 @@ from pointsplat_ns.pruning import (
     score_of,
     select,
 )
-from pointsplat_ns.pruning.merging import Merger, merge
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.views import Views
 

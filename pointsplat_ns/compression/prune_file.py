@@ -19,9 +19,9 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.merging.cells import Scratch, merge_file
+from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.pruning import found_by_trying
-from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
-from pointsplat_ns.pruning.merging.settings import MERGING
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import check_jobs
 from pointsplat_ns.views import Views

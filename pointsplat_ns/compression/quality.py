@@ -15,7 +15,7 @@ from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import subsampled
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.system.tensors import INDICES
 from pointsplat_ns.views import Views, spread_indices
 

@@ -14,9 +14,9 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import keep_usable, one_line
 from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.merging import Merger
 from pointsplat_ns.pruning import resolve_keep, select
 from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.merging import Merger
 
 
 @dataclass(eq=False)

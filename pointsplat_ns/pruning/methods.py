@@ -13,9 +13,9 @@ from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneE
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.merging import merge
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.pruning.scores import (
     area_score,
     authors_score,

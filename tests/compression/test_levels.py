@@ -11,10 +11,10 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
-from pointsplat_ns.compression import level_folder
-from pointsplat_ns.compression.level_errors import displacement
+from pointsplat_ns.levels import folder as level_folder
+from pointsplat_ns.levels.errors import displacement
 from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.pruning.merging import merge_levels
+from pointsplat_ns.merging import merge_levels
 
 ASKED = ("50%", "25%", "10%", "3%")
 

@@ -16,7 +16,7 @@ import pointsplat_ns as ps
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import RepairBudget, repair
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.system.threads import fixed_threads
 
 quick = dataclasses.replace(MERGING, finish_views=1)

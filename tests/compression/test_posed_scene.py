@@ -13,7 +13,6 @@ import torch
 import pointsplat_ns as ps
 from making import SHARED_DATA, ball, cloud, run_of, views_from_within
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.placing import run_frame
 from pointsplat_ns.compression.posed_scene import PosesFile, read_posed
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -22,6 +21,7 @@ from pointsplat_ns.io.camera_files import read_named_views
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.upright import axis_named
+from pointsplat_ns.placing import run_frame
 from posing import inria, name_of, nerfstudio, write_colmap_text, written
 
 

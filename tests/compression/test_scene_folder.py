@@ -13,14 +13,14 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.compression import scene_folder
-from pointsplat_ns.compression.scene_folder import Command, SceneTask, run_on_folder
+from pointsplat_ns import scene_folder
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.formats.sog import encode_sog, sog_bytes_like
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.scene_folder import Command, SceneTask, run_on_folder
 from pointsplat_ns.system.claims import claim
 from scene_work import halve
 

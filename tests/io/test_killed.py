@@ -11,9 +11,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.compression.level_folder import write_levels
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import write_json
+from pointsplat_ns.levels.folder import write_levels
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes that it forks")
 
@@ -22,7 +22,7 @@ import json, os, resource, shutil, signal, sys
 from pathlib import Path
 import plyfile, torch
 import pointsplat_ns as ps
-from pointsplat_ns.compression.level_folder import write_levels
+from pointsplat_ns.levels.folder import write_levels
 from pointsplat_ns.io.files import write_json
 
 base = here = Path(sys.argv[1])

@@ -17,7 +17,7 @@ from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of, weights
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.pruning.merging.covariance import covariances, unpack
+from pointsplat_ns.merging.covariance import covariances, unpack
 from pointsplat_ns.rasterizer import render
 
 SILENT = lambda *told: None  # noqa: E731

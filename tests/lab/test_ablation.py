@@ -7,7 +7,7 @@ from pathlib import Path
 from lab.judge import ablation, record, scenes
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.pruning.merging import MERGING, merge
+from pointsplat_ns.merging import MERGING, merge
 
 TWO = ("no_regrouping", "growth_0")
 

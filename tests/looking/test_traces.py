@@ -15,8 +15,8 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, correlation, photo_places, trace_factors
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.merging import merge
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning.merging import merge
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
 

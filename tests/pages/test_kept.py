@@ -10,7 +10,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.compression.level_stream import Chunks
+from pointsplat_ns.levels.stream import Chunks
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import kept as module
 from pointsplat_ns.pages.kept import Level, Levels

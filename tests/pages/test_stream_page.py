@@ -9,8 +9,8 @@ import torch
 import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.level_stream import write_stream
 from pointsplat_ns.io.turning import Similarity
+from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.pages.stream_page import StreamPage, page_files, stream_page

@@ -14,9 +14,9 @@ from PIL import Image
 import pointsplat_ns as ps
 from browser import chromium, complaints, waited
 from making import normal_scene
-from pointsplat_ns.compression.level_stream import Chunks, write_stream
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.files import open_inside
+from pointsplat_ns.levels.stream import Chunks, write_stream
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.pages.stream_page import stream_page

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from pointsplat_ns.compression.scene_folder import SmallerScene
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.scene_folder import SmallerScene
 
 
 def halve(scene: Gaussians, path: Path, journal: Path) -> SmallerScene:

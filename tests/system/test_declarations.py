@@ -7,8 +7,8 @@ import subprocess
 import pytest
 import torch
 
+from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.metrics import structural_similarity
-from pointsplat_ns.pruning.merging import covariance, matching, pair_cost, regrouping, replacement
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import functions_of, structs_of

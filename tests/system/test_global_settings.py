@@ -17,7 +17,7 @@ from torch.utils._device import _device_constructors
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
 from pointsplat_ns.compression import repair
-from pointsplat_ns.compression.level_stream import Chunks
+from pointsplat_ns.levels.stream import Chunks
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 from pointsplat_ns.system.tensors import FLAGS, FLOATS

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
 
 
 @dataclass(frozen=True)

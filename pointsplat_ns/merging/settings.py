@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MergeSettings:
-    """Settings of :func:`~pointsplat_ns.pruning.merging.merge`, in the order of its steps.
+    """Settings of :func:`~pointsplat_ns.merging.merge`, in the order of its steps.
 
     Example:
         >>> from dataclasses import replace

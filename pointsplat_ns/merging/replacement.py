@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.covariance import (
+from pointsplat_ns.merging.covariance import (
     MIN_DIVISOR,
     outer,
     overlap,
@@ -32,8 +32,8 @@ from pointsplat_ns.pruning.merging.covariance import (
     rms_area,
     thinnest_axes,
 )
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.pruning.merging.state import State, bounded
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import State, bounded
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES

@@ -8,13 +8,13 @@ import torch
 
 from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import MERGING
-from pointsplat_ns.pruning.merging.covariance import covariances, unpack
-from pointsplat_ns.pruning.merging.matching import KERNELS, cheapest_pairs
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.regrouping import Members, Moments, best_groups, group_moments
-from pointsplat_ns.pruning.merging.replacement import replace_pairs
-from pointsplat_ns.pruning.merging.state import State, initial_state
+from pointsplat_ns.merging import MERGING
+from pointsplat_ns.merging.covariance import covariances, unpack
+from pointsplat_ns.merging.matching import KERNELS, cheapest_pairs
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.regrouping import Members, Moments, best_groups, group_moments
+from pointsplat_ns.merging.replacement import replace_pairs
+from pointsplat_ns.merging.state import State, initial_state
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 

@@ -19,9 +19,9 @@ from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_writing import header_bytes, row_table
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.pruning.merging import MERGING, MergeSettings, merge
-from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
-from pointsplat_ns.pruning.merging.cells.partition import divided
+from pointsplat_ns.merging import MERGING, MergeSettings, merge
+from pointsplat_ns.merging.cells import Scratch, merge_file
+from pointsplat_ns.merging.cells.partition import divided
 from pointsplat_ns.system.memory import PeakMemory
 
 
@@ -110,9 +110,9 @@ def test_any_number_of_threads_gives_the_same_bits(tmp_path):
 KILLED = """
 from dataclasses import replace
 from pathlib import Path
-from pointsplat_ns.pruning.merging import MERGING
+from pointsplat_ns.merging import MERGING
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.pruning.merging.cells import Scratch, merge_file
+from pointsplat_ns.merging.cells import Scratch, merge_file
 here = Path(sys.argv[1])
 for at in (4, 9, 0):  # as often as it is killed, it is started again
     assert not (here / "small.ply").exists()
@@ -178,8 +178,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.pruning.merging.cells import Scratch, merge_file, partition
-from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.merging.cells import Scratch, merge_file, partition
+from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.system.memory import PeakMemory
 partition.CELLS = partition.CellSettings(rows_at_once=1 << 13, overview=1 << 12)
 peaks = []

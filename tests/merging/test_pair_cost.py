@@ -9,9 +9,9 @@ import torch
 from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.pruning.merging import MERGING
-from pointsplat_ns.pruning.merging import covariance as algebra
-from pointsplat_ns.pruning.merging.covariance import (
+from pointsplat_ns.merging import MERGING
+from pointsplat_ns.merging import covariance as algebra
+from pointsplat_ns.merging.covariance import (
     covariances,
     overlap,
     plane_axes,
@@ -19,15 +19,15 @@ from pointsplat_ns.pruning.merging.covariance import (
     projected_area,
     rms_area,
 )
-from pointsplat_ns.pruning.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.projections import (
+from pointsplat_ns.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.projections import (
     DIRECTIONS,
     PLANE_AXES,
     TO_PLANE,
     Projections,
 )
-from pointsplat_ns.pruning.merging.state import State, initial_state
+from pointsplat_ns.merging.state import State, initial_state
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 

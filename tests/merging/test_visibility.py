@@ -12,10 +12,10 @@ from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
-from pointsplat_ns.pruning.merging import MERGING, visibility
-from pointsplat_ns.pruning.merging.finishing import best_finish, top_of_parabola
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.visibility import (
+from pointsplat_ns.merging import MERGING, visibility
+from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.visibility import (
     Viewpoints,
     covered_per_area,
     sampled_viewpoints,

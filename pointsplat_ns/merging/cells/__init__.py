@@ -9,7 +9,7 @@
 What a step has written is kept, and a command that was killed resumes from there (``scratch.py``).
 """
 
-from pointsplat_ns.pruning.merging.cells.merge import merge_file
-from pointsplat_ns.pruning.merging.cells.scratch import Scratch
+from pointsplat_ns.merging.cells.merge import merge_file
+from pointsplat_ns.merging.cells.scratch import Scratch
 
 __all__ = ["Scratch", "merge_file"]

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import quaternions_of
-from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, unpack
-from pointsplat_ns.pruning.merging.groups import Groups
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.settings import MergeSettings
+from pointsplat_ns.merging.covariance import MIN_DIVISOR, unpack
+from pointsplat_ns.merging.groups import Groups
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.settings import MergeSettings
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.tensors import DOUBLES, INDICES

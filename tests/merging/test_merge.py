@@ -10,9 +10,9 @@ import torch
 from making import ball, cloud, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.merging import MERGING, Finish, Merged, Merger, merge, merge_levels
-from pointsplat_ns.pruning.merging import covariance as algebra
-from pointsplat_ns.pruning.merging.merged_scene import deepened
+from pointsplat_ns.merging import MERGING, Finish, Merged, Merger, merge, merge_levels
+from pointsplat_ns.merging import covariance as algebra
+from pointsplat_ns.merging.merged_scene import deepened
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.kernels import Kernels

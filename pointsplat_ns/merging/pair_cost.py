@@ -19,7 +19,7 @@ scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers draw 6 % fewer Gauss
 
 W_i is the visibility weight of i. c_0, b, c_min and d are ``min_contrast``, ``background_contrast``, ``min_cover`` and
 ``background_decay`` of the settings. The replacement has the common mass, centre and covariance, as in
-:mod:`~pointsplat_ns.pruning.merging.replacement`, with areas in the plane. All integrals are sums of overlaps, which
+:mod:`~pointsplat_ns.merging.replacement`, with areas in the plane. All integrals are sums of overlaps, which
 have a closed form:
 
     <G_p, G_q> = integral of G_p G_q = A_p A_q / A_pq * exp(-d_pq^2 / 2),   <G_p, G_p> = A_p / 2
@@ -40,11 +40,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging import projections as planes
-from pointsplat_ns.pruning.merging.projections import DIRECTIONS, PROJECTION_LIMITS, Projections, area_of, directions_of
-from pointsplat_ns.pruning.merging.replacement import growth
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.pruning.merging.state import State
+from pointsplat_ns.merging import projections as planes
+from pointsplat_ns.merging.projections import DIRECTIONS, PROJECTION_LIMITS, Projections, area_of, directions_of
+from pointsplat_ns.merging.replacement import growth
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
@@ -156,7 +156,7 @@ def costs_in_plane(projections: Projections, i: Tensor, j: Tensor, settings: Mer
 
 def overlap_of_sum(uu: Tensor, uv: Tensor, vv: Tensor, areas: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Overlap of two projections, in units of 2 pi; the fast form of
-    :func:`~pointsplat_ns.pruning.merging.covariance.overlap`, for covariances that are not nearly lines.
+    :func:`~pointsplat_ns.merging.covariance.overlap`, for covariances that are not nearly lines.
 
     Args:
         uu, uv, vv: summed covariance.

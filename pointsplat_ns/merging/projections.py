@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.covariance import plane_axes
-from pointsplat_ns.pruning.merging.state import State
+from pointsplat_ns.merging.covariance import plane_axes
+from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 DIRECTIONS = torch.nn.functional.normalize(

@@ -18,15 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.level_errors import (
-    Displacement,
-    RenderErrors,
-    displacement,
-    far_references,
-    median_depth,
-)
-from pointsplat_ns.compression.level_folder import write_levels
-from pointsplat_ns.compression.level_stream import Chunks, write_stream
 from pointsplat_ns.compression.pictures import size_quantiles
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
@@ -34,12 +25,21 @@ from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
+from pointsplat_ns.levels.errors import (
+    Displacement,
+    RenderErrors,
+    displacement,
+    far_references,
+    median_depth,
+)
+from pointsplat_ns.levels.folder import write_levels
+from pointsplat_ns.levels.stream import Chunks, write_stream
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.merging import merge_levels
 from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.pruning.merging import merge_levels
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -161,7 +161,7 @@ class Levels:
         page: StreamPage | None = None,
     ) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
-        :func:`~pointsplat_ns.compression.level_stream.write_stream`. Returns the number of Gaussians of each."""
+        :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
         parents = [level.parents for level in self.levels[1:]]
         return write_stream(folder, self.scenes, parents, chunks, force, progress, page)
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.pruning.merging.covariance import covariances_of
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.settings import MergeSettings
+from pointsplat_ns.merging.covariance import covariances_of
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.settings import MergeSettings
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
 

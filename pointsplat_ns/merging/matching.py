@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.settings import MERGING
+from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES

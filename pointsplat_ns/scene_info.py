@@ -25,7 +25,7 @@ from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning.duplicates import Copies
+from pointsplat_ns.merging.duplicates import Copies
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.tensors import DOUBLES, INDICES

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.pruning.merging.cells.partition import Cells
-from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.rounds import views_and_weights
-from pointsplat_ns.pruning.merging.settings import MergeSettings
-from pointsplat_ns.pruning.merging.state import ColourAxes, principal_axes
+from pointsplat_ns.merging.cells.partition import Cells
+from pointsplat_ns.merging.participants import Participants, drawable
+from pointsplat_ns.merging.rounds import views_and_weights
+from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.merging.state import ColourAxes, principal_axes
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
@@ -45,7 +45,7 @@ def overview_of(
     views: Views | Sampler,
     settings: MergeSettings,
 ) -> Overview:
-    """The overview of a scene; ``views`` as for :func:`~pointsplat_ns.pruning.merging.merge`."""
+    """The overview of a scene; ``views`` as for :func:`~pointsplat_ns.merging.merge`."""
     share = cells.count / len(cells.sample)
     scene = cells.sample.replace(scales=cells.sample.scales + 0.5 * math.log(share))  # they cover as much as all
     members = drawable(scene, 1)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.state import State
-from pointsplat_ns.pruning.merging.tree import Tree
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.state import State
+from pointsplat_ns.merging.tree import Tree
 from pointsplat_ns.system.tensors import INDICES
 
 

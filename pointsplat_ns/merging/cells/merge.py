@@ -22,20 +22,20 @@ from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_writing import header_bytes, ply_bytes, row_table
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.pruning.duplicates import Copies
-from pointsplat_ns.pruning.merging.cells.overview import Overview, overview_of
-from pointsplat_ns.pruning.merging.cells.partition import CELLS, Cells, divided
-from pointsplat_ns.pruning.merging.cells.scratch import Scratch
-from pointsplat_ns.pruning.merging.groups import Groups, first_members
-from pointsplat_ns.pruning.merging.matching import candidate_pairs
-from pointsplat_ns.pruning.merging.merged_scene import scene_maker
-from pointsplat_ns.pruning.merging.pair_cost import pair_costs
-from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.regrouping import areas_of, regrouped
-from pointsplat_ns.pruning.merging.replacement import replace_pairs
-from pointsplat_ns.pruning.merging.rounds import merge
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.pruning.merging.state import State, initial_state
+from pointsplat_ns.merging.cells.overview import Overview, overview_of
+from pointsplat_ns.merging.cells.partition import CELLS, Cells, divided
+from pointsplat_ns.merging.cells.scratch import Scratch
+from pointsplat_ns.merging.duplicates import Copies
+from pointsplat_ns.merging.groups import Groups, first_members
+from pointsplat_ns.merging.matching import candidate_pairs
+from pointsplat_ns.merging.merged_scene import scene_maker
+from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.participants import Participants, drawable
+from pointsplat_ns.merging.regrouping import areas_of, regrouped
+from pointsplat_ns.merging.replacement import replace_pairs
+from pointsplat_ns.merging.rounds import merge
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import State, initial_state
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each

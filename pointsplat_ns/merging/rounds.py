@@ -22,19 +22,19 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
-from pointsplat_ns.pruning.duplicates import Copies, Reduced
-from pointsplat_ns.pruning.merging.finishing import Finish, best_finish
-from pointsplat_ns.pruning.merging.groups import merged_groups
-from pointsplat_ns.pruning.merging.matching import cheapest_pairs
-from pointsplat_ns.pruning.merging.merged_scene import scene_maker
-from pointsplat_ns.pruning.merging.pair_cost import pair_costs
-from pointsplat_ns.pruning.merging.participants import Participants, drawable
-from pointsplat_ns.pruning.merging.regrouping import areas_of, regrouped
-from pointsplat_ns.pruning.merging.replacement import replace_pairs
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.pruning.merging.state import State, initial_state
-from pointsplat_ns.pruning.merging.tree import Tree
-from pointsplat_ns.pruning.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
+from pointsplat_ns.merging.duplicates import Copies, Reduced
+from pointsplat_ns.merging.finishing import Finish, best_finish
+from pointsplat_ns.merging.groups import merged_groups
+from pointsplat_ns.merging.matching import cheapest_pairs
+from pointsplat_ns.merging.merged_scene import scene_maker
+from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.participants import Participants, drawable
+from pointsplat_ns.merging.regrouping import areas_of, regrouped
+from pointsplat_ns.merging.replacement import replace_pairs
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import State, initial_state
+from pointsplat_ns.merging.tree import Tree
+from pointsplat_ns.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each

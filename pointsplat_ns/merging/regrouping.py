@@ -24,12 +24,12 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import NearestOf
-from pointsplat_ns.pruning.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
-from pointsplat_ns.pruning.merging.groups import Groups, first_members
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.replacement import enlarged
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.pruning.merging.state import bounded_colours
+from pointsplat_ns.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
+from pointsplat_ns.merging.groups import Groups, first_members
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.replacement import enlarged
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import bounded_colours
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, INDICES

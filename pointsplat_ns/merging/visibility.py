@@ -25,8 +25,8 @@ from pointsplat_ns.looking.content import every_nth
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.traces import trace_factors
-from pointsplat_ns.pruning.merging.participants import Participants
-from pointsplat_ns.pruning.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
