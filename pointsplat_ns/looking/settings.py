@@ -35,7 +35,7 @@ class LookingSettings:
 
     energy_exponent: float = 0.75
     """Exponent of the mean energy of the SH in a trace factor; 0 turns it off. Fitted, together with that of the
-    flatness, to the poses of four captures. At 10 %, fox loses 0.9 dB without it, 2.0 without trace factors."""
+    flatness, to the poses of four captures."""
 
     flatness_exponent: float = 1.0
     """Exponent of the mean flatness in a trace factor; 0 turns it off."""
@@ -44,7 +44,8 @@ class LookingSettings:
     """Exponent of the mean flatness in scenes without SH; 0 turns it off."""
 
     max_log_factor: float = 8.0
-    """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off."""
+    """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off. Without them six captures
+    lose 0.1 dB on average at 10 %, four of them 0.2 to 0.4, and one gains 0.5."""
 
     # Photo places (traces.py)
 
