@@ -130,7 +130,10 @@ class Candidates:
 
     def _at_gaussians(self, count: int, generator: torch.Generator) -> Tensor:
         """Cameras (count, 4, 4) that look at Gaussians at any pitch, from where their neighbourhood is as small as in
-        photos, or, if that is too far away, from any distance."""
+        photos, or, if that is too far away, from any distance.
+
+        Pitches between -50 and 10 degrees lose 0.2 dB on average over six captures at 10 %, most where up is wrong.
+        """
         aim = self._targets(count, generator)
         angle, turn, pitch = torch.rand(3, count, generator=generator, **DOUBLES)
         small, large = LOOKING.apparent_sizes

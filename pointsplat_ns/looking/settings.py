@@ -44,8 +44,8 @@ class LookingSettings:
     """Exponent of the mean flatness in scenes without SH; 0 turns it off."""
 
     max_log_factor: float = 8.0
-    """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off. Without them six captures
-    lose 0.1 dB on average at 10 %, four of them 0.2 to 0.4, and one gains 0.5."""
+    """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off. Without them six
+    captures lose 0.1 dB on average at 10 %, four of them 0.2 to 0.4, and one gains 0.5."""
 
     # Photo places (traces.py)
 
