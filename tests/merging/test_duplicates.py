@@ -8,9 +8,9 @@ import torch
 from making import cloud, normal_scene, same
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.merging import merge, rounds
+from pointsplat_ns.merging import duplicates, merge, rounds
 from pointsplat_ns.merging.duplicates import Copies, stacked
-from pointsplat_ns.pruning import band_energies, cut_sh, duplicates, energy_lost
+from pointsplat_ns.pruning import band_energies, cut_sh, energy_lost
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
