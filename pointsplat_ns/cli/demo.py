@@ -170,18 +170,19 @@ def write_capture(scene: Gaussians, folder: Path) -> None:
     from pointsplat_ns.io.pictures import write_picture
     from pointsplat_ns.looking.poses import look_at, views_of
     from pointsplat_ns.system.progress import tracked
+    from pointsplat_ns.system.tensors import FLOATS
 
     (folder / "images").mkdir(parents=True)
-    turn = torch.arange(DEMO.photos) * 2 * math.pi / DEMO.photos
-    yaw = turn + torch.tensor([0.6, 0.0, -0.6]).repeat(DEMO.photos // 3)  # rad: across the middle, and to both sides
+    turn = torch.arange(DEMO.photos, **FLOATS) * 2 * math.pi / DEMO.photos
+    yaw = turn + turn.new_tensor([0.6, 0.0, -0.6]).repeat(DEMO.photos // 3)  # rad: across the middle, and to both sides
     eyes = torch.stack([DEMO.walk * turn.cos(), DEMO.walk * turn.sin(), 1.5 + 0.2 * (3 * turn).sin()], dim=1)
     ahead = torch.stack([-yaw.cos(), -yaw.sin(), torch.full_like(yaw, -0.2)], dim=1)
     views = views_of(look_at(eyes, eyes + ahead), *DEMO.size, diagonal=5.0)
-    frames = []
+    to_opengl, frames = torch.diag(turn.new_tensor([1.0, -1.0, -1.0, 1.0])), []
     for number, view in enumerate(tracked(views, "drawing photos", len(views))):
         name = f"images/{number:02d}.png"
         write_picture(ps.render(scene, view), folder / name)
-        pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # OpenGL's axes
+        pose = torch.linalg.inv(view.viewmat) @ to_opengl
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     (width, height), K = DEMO.size, views.Ks[0].tolist()
     camera = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": width, "h": height}

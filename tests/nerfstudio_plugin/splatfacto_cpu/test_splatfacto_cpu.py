@@ -14,8 +14,7 @@ from nerfstudio.utils import writer
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel, SplatfactoCpuModelConfig
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuTrainer
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.stopping import STATE
 from pointsplat_ns.rasterizer import rasterization
 
@@ -158,31 +157,6 @@ def test_training_lowers_the_loss_and_densifies(trained):
     assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
     assert trainer.pipeline.model.num_points > 300
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
-
-
-def test_the_last_picture_and_an_open_viewer_do_not_draw_at_once(
-    wall_scene, wall_config, run_training, monkeypatch, tmp_path
-):
-    trainers, drawn = [], []
-    setup, draw = SplatfactoCpuTrainer.setup, SplatfactoCpuModel.get_outputs
-
-    def noted(trainer):
-        trainers.append(trainer)
-        setup(trainer)
-
-    def beside_a_viewer(model, camera):
-        if not model.training:
-            lock = trainers[0].train_lock
-            drawn.append(lock.locked())
-            if lock.acquire(blocking=False):  # the viewer's thread is done with a picture that it began in a step
-                model.train()
-                lock.release()
-        return draw(model, camera)
-
-    monkeypatch.setattr(SplatfactoCpuTrainer, "setup", noted)
-    monkeypatch.setattr(SplatfactoCpuModel, "get_outputs", beside_a_viewer)
-    run_training(wall_config(wall_scene, tmp_path, steps=1))
-    assert drawn == [True]
 
 
 def test_checkpoint_has_splatfactos_layout_and_loads_weights_only(trained):
