@@ -7,7 +7,6 @@ outdoors, where nobody stands outside of everything, they are not.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -46,7 +45,7 @@ def opening_views(
 
     If a view from around the scene, which shows all of it, is at least as likely as half of the known views, or of
     sampled ones, it comes first, and others of its kind or known ones follow. Else known or sampled views come, the
-    likeliest first. Views complete each other. Sampled views that look steeply up or down are left out.
+    likeliest first. Views complete each other.
 
     Args:
         scene: N Gaussians.
@@ -63,9 +62,7 @@ def opening_views(
     content, candidates = sampler.content, sampler.candidates
     if known is None:
         generator = torch.Generator().manual_seed(0)
-        viewmats = candidates.views(48, generator)
-        level = (viewmats[:, 2, :3] @ sampler.up.direction).abs() < math.sin(math.radians(45))
-        others = views_of(viewmats[level] if bool(level.any()) else viewmats, width, height, UNITS)
+        others = views_of(candidates.views(24, generator), width, height, UNITS)
     else:
         others, width, height = views_in_units(known, *content), known.width, known.height
 

@@ -101,7 +101,7 @@ def test_what_is_behind_walls_goes_and_no_view_changes(kind, room, views, monkey
     scene = Gaussians.cat([room, JUNK[kind]])
     undrawable, unseen = junk_of(scene)
     assert undrawable == [] and unseen[-PLANTED:] == list(range(ROOM, ROOM + PLANTED))
-    assert len(unseen) <= 2 * PLANTED, "of the walls only a few that are behind others"
+    assert len(unseen) <= 3 * PLANTED, "of the walls only a few that are behind others"
     assert DenseReference(scene, views).psnr(room)[0] == math.inf  # views that chose nothing
 
 

@@ -55,7 +55,7 @@ def test_the_likelihood_is_that_of_its_formula():
         blur = float((pixels * 0.06 / away).sum() / pixels.sum())
         empty = 1 - float(pixels.sum()) / (view.width * view.height)
         share = (float((pixels > LOOKING.min_candidate_pixels).sum()) + 1) / len(scene)
-        expected = math.log(share / (empty + MIN_EMPTY) / blur**2)
+        expected = math.log(share / (empty + MIN_EMPTY) / blur**2) - 0.5 * (15 / 25) ** 2  # they look level
         assert float(likelihoods[row]) == pytest.approx(expected, abs=1e-4)  # float32
         assert float(shown[row].sum()) + 1 == pytest.approx(share * len(scene))
 

@@ -175,7 +175,7 @@ def test_photos_of_a_room_come_before_a_view_from_outside():
     eyes = torch.tensor([[-1.5, -1.0, 0.3], [1.5, 1.0, 0.3], [0.0, 0.0, 0.2]], dtype=torch.float64)
     targets = torch.tensor([[1.5, 1.0, -0.5], [-1.5, -1.0, -0.5], [0.0, 0.0, 1.2]], dtype=torch.float64)
     photos = replace(views_of(look_at(eyes, targets, UP), 64, 40, 5.0), background=torch.tensor([0.1, 0.2, 0.3]))
-    found = opening_views(scene, 2, known=photos)
+    found = opening_views(scene, 2, up=Up(UP), known=photos)
     assert not found.whole and found.views.background.tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert all(any(torch.equal(view, photo) for photo in photos.viewmats) for view in found.views.viewmats)
     assert not torch.equal(found.views.viewmats[0], photos.viewmats[2]), "the ceiling shows least"

@@ -12,7 +12,7 @@ from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of
+from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -83,7 +83,7 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
         camera, data = frames[-1]
         views = Views(
             viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices(), 32, 24, scene.background,
-            eps2d=eps2d_of(camera),
+            near_plane=near_plane_of(camera), eps2d=eps2d_of(camera),
         )  # fmt: skip
         image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
         # half a level where they are rounded, float32 noise where they are not
