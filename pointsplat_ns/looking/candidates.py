@@ -7,13 +7,13 @@ likelihood, up to a constant, is
 
     log(shown) - log(empty + 0.01) - 2 log(blur) + 0.75 evidence - (pitch + 15)^2 / (2 25^2)
 
-with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture of the
-angle that a Gaussian subtends, radians, the evidence of SH for its place, and its pitch, degrees: few photos look far
-up or down. A logistic regression between the poses of six captures and candidates gives 1.2, 1.3 and 0.75 without blur and
-pitch: with each capture left out in turn, a pose of it is likelier than a candidate in 89 % of cases. Blur tells poses
-from candidates no better; views from within walls, which captures lack, need it. Candidates whose pitch is bound to -50
-to 10 degrees instead lose 0.2 dB on average over the six at 10 %, most where the estimated up is wrong.
-``docs/concepts/sampled_views.md`` says more.
+with the share of the Gaussians that are shown, the share of the picture that is empty, the mean over the picture of
+the angle that a Gaussian subtends, radians, the evidence of SH for its place, and its pitch, degrees: few photos look
+far up or down. A logistic regression between the poses of six captures and candidates gives 1.2, 1.3 and 0.75 without
+blur and pitch: with each capture left out in turn, a pose of it is likelier than a candidate in 89 % of cases. Blur
+tells poses from candidates no better; views from within walls, which captures lack, need it. Candidates whose pitch
+is bound to -50 to 10 degrees instead lose 0.2 dB on average over the six at 10 %, most where the estimated up is
+wrong. ``docs/concepts/sampled_views.md`` says more.
 """
 
 from __future__ import annotations
