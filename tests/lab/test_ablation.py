@@ -4,6 +4,8 @@ import dataclasses
 import json
 from pathlib import Path
 
+import pytest
+
 from lab.judge import ablation, record, scenes
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.looking.settings import LOOKING
@@ -63,6 +65,7 @@ def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, mo
     assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
 
 
+@pytest.mark.usefixtures("usual_looking")
 def test_the_record_that_is_committed_has_the_page_of_its_rows():
     rows, settings = record.read([record.FOLDER / "ablation.json"], "ablation.py")
     assert (record.FOLDER / "ablation.md").read_text("utf-8") == ablation.page(rows, settings)

@@ -75,6 +75,7 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
     assert same_bits(read[order], scene[wanted])
 
 
+@pytest.mark.usefixtures("usual_looking")
 def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
     scene = box_room(seed=3, count=4000, size=0.13)
     rows, k = rows_of(scene, tmp_path), 400
