@@ -9,20 +9,21 @@ import pytest
 from lab.rooms import light
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
-from quick_looking import QUICK, USUAL, looking
+from pointsplat_ns.looking.settings import changed
+from quick_looking import QUICK, USUAL
 
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_looking() -> Iterator[None]:
     """Views are chosen from few candidates, unless a test is about which are chosen."""
-    with looking(QUICK):
+    with changed(QUICK):
         yield
 
 
 @pytest.fixture(scope="module")
 def usual_looking() -> Iterator[None]:
     """The settings of looking as they ship, for tests of what they are good for."""
-    with looking(USUAL):
+    with changed(USUAL):
         yield
 
 

@@ -98,7 +98,8 @@ def render_path(
     need_named_data(scene, data)
     sources = [scene] if other is None else [scene, other]
     first, given = _with_views(scene, NO_POSES if views is None and path is not None else views)
-    given = None if given is None else given.resized(CAMERA_PATH.photo_side) if not isinstance(views, Views) else given
+    if given is not None and not isinstance(views, Views):  # from a file, as large as its photos
+        given = given.resized(CAMERA_PATH.photo_side)
     loaded = [first if source is scene else _loaded(source).at_offset(first.offset) for source in sources]
     if given is not None and kind == "frames" and seconds is None and path is None:
         settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))

@@ -31,7 +31,7 @@ from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS, DenseViews, JudgedScene, check, check_options, known_rows, load
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.looking.settings import LOOKING, changed
 from pointsplat_ns.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import tracked
@@ -145,14 +145,8 @@ def settings_of(views: int, width: int) -> dict[str, Any]:
 def applied(changes: dict[str, Any]) -> Iterator[MergeSettings]:
     """Settings of merging with changes. Those of looking are changed while the context is open."""
     looking = {name: value for name, value in changes.items() if name in vars(LOOKING)}
-    before = {name: getattr(LOOKING, name) for name in looking}
-    try:
-        for name, value in looking.items():
-            object.__setattr__(LOOKING, name, value)  # every module holds this one object
+    with changed(looking):
         yield dataclasses.replace(MERGING, **{name: v for name, v in changes.items() if name not in looking})
-    finally:
-        for name, value in before.items():
-            object.__setattr__(LOOKING, name, value)
 
 
 def current(rows: list[Row]) -> list[Row]:

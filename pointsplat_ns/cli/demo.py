@@ -167,6 +167,7 @@ def write_capture(scene: Gaussians, folder: Path) -> None:
 
     import pointsplat_ns as ps
     from pointsplat_ns.geometry.harmonics import SH_C0
+    from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
     from pointsplat_ns.io.pictures import write_picture
     from pointsplat_ns.looking.poses import look_at, views_of
     from pointsplat_ns.system.progress import tracked
@@ -178,12 +179,11 @@ def write_capture(scene: Gaussians, folder: Path) -> None:
     eyes = torch.stack([DEMO.walk * turn.cos(), DEMO.walk * turn.sin(), 1.5 + 0.2 * (3 * turn).sin()], dim=1)
     ahead = torch.stack([-yaw.cos(), -yaw.sin(), torch.full_like(yaw, -0.2)], dim=1)
     views = views_of(look_at(eyes, eyes + ahead), *DEMO.size, diagonal=5.0)
-    to_opengl, frames = torch.diag(turn.new_tensor([1.0, -1.0, -1.0, 1.0])), []
+    poses, frames = flip_camera_axes(invert_rigid(views.viewmats)).tolist(), []
     for number, view in enumerate(tracked(views, "drawing photos", len(views))):
         name = f"images/{number:02d}.png"
         write_picture(ps.render(scene, view), folder / name)
-        pose = torch.linalg.inv(view.viewmat) @ to_opengl
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        frames.append({"file_path": name, "transform_matrix": poses[number]})
     (width, height), K = DEMO.size, views.Ks[0].tolist()
     camera = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": width, "h": height}
 

@@ -7,6 +7,8 @@ stands for a rule of its own. A unit is a tenth of the diagonal of the scene's c
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -131,3 +133,20 @@ class LookingSettings:
 
 LOOKING = LookingSettings()
 """The settings in use."""
+
+
+@contextmanager
+def changed(values: Mapping[str, object]) -> Iterator[None]:
+    """Within, fields of the settings in use have other values, in every module: for measurements and tests.
+
+    Raises:
+        AttributeError: if there is no such field.
+    """
+    before = {name: getattr(LOOKING, name) for name in values}
+    try:
+        for name, value in values.items():
+            object.__setattr__(LOOKING, name, value)  # every module holds this one object
+        yield
+    finally:
+        for name, value in before.items():
+            object.__setattr__(LOOKING, name, value)

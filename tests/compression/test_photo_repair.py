@@ -23,10 +23,11 @@ from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair
 from pointsplat_ns.compression.requests import PHOTO_STEPS, PhotoBudget
 from pointsplat_ns.errors import BudgetError, DataError, SceneError
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D
-from quick_looking import USUAL, looking
+from quick_looking import USUAL
 
 CPU = torch.device("cpu")
 
@@ -88,7 +89,7 @@ def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pru
         photo if index % 8 else photo._replace(target=photo.target.lerp(known_render, known))
         for index, (photo, known_render) in enumerate(zip(photos, renders, strict=True))
     ]
-    with looking(USUAL):
+    with changed(USUAL):
         trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
     assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
     if kept:

@@ -14,10 +14,11 @@ from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
-from quick_looking import USUAL, looking
+from quick_looking import USUAL
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +53,7 @@ def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
     """In a room that the network was not trained on, and in views that no step has seen."""
     monkeypatch.setitem(STEPS, "quick", 6)
     room = example_room()
-    with looking(USUAL):
+    with changed(USUAL):
         pruned = prune(room, 0.1, "merge")
         reference = DenseReference(room, sample_views(room, 6, 160, 120, seed=99))
         source = ViewSource(room, given=sample_views(room, 32, 160, 120, seed=98))

@@ -13,7 +13,8 @@ import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
-from quick_looking import QUICK, looking
+from pointsplat_ns.looking.settings import changed
+from quick_looking import QUICK
 
 tried: list[str] = []
 
@@ -48,5 +49,5 @@ if __name__ == "__main__":
 
     view_source.RESOLUTION = (64, 48)
     commands, results = map(Path, sys.argv[1:])
-    with looking(QUICK):
+    with changed(QUICK):
         results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))

@@ -21,12 +21,13 @@ from lab import feedback_training
 from making import REPOSITORY, ball, box_room, dense_config, quick_start, views_sampled_once
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
+from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
 from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.system.processes import average_gradients, gathered
-from quick_looking import QUICK, looking
+from quick_looking import QUICK
 
 pytestmark = pytest.mark.xdist_group("distributed")  # one worker trains for all tests of this file
 
@@ -273,7 +274,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 
 if __name__ == "__main__":
     child = os.fork()  # nothing has been computed, so there are no threads yet
-    with looking(QUICK), views_sampled_once():
+    with changed(QUICK), views_sampled_once():
         work(0 if child else 1, Path(sys.argv[1]))
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
