@@ -205,7 +205,7 @@ def _compacted(
     source = _views_of(dense, path, resolution, data)
     if (whole := _kept_whole(dense, request.prune, source)) is not None:
         return whole
-    request = replace(request, prune=request.prune.in_format(format_like(path)), refiner=_loaded(refiner))
+    request = replace(request, prune=_for(path, request.prune), refiner=_loaded(refiner))
     result = compact_scene(dense, request, source)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
@@ -216,6 +216,11 @@ def _views_of(dense: Gaussians, path: Path, resolution: tuple[int, int] | None, 
     """The views of one scene of a folder."""
     read = functools.partial(dataset_views, data=data)
     return ViewSource(dense, run=path, dataset_views=read, resolution=resolution)
+
+
+def _for(path: Path, request: PruneRequest) -> PruneRequest:
+    """A request for a result in the format of a scene."""
+    return replace(request, suffix=format_like(path).budget_suffix)
 
 
 def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> SmallerScene | None:
@@ -234,7 +239,7 @@ def _pruned(
     source = _views_of(dense, path, resolution, data)
     if (whole := _kept_whole(dense, request, source)) is not None:
         return whole
-    pruned = prune_scene(dense, request.in_format(format_like(path)), source)
+    pruned = prune_scene(dense, _for(path, request), source)
     quality = quality_of_pruned(dense, pruned, source)
     return SmallerScene(pruned.scene, None if quality is None else quality.psnr, source.missing[2:-1])
 

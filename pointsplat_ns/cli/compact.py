@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -152,8 +152,9 @@ def compact(
     claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     kind = format_to_write(output)
-    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
-    request = replace(request, prune=request.prune.in_format(kind))
+    request = CompactRequest.of(
+        _loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos, kind.budget_suffix
+    )
     goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(

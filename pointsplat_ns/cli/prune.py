@@ -124,7 +124,7 @@ def prune(
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
     claim_outputs(written, force, plot)
-    request = PruneRequest(keep, by, sh, opacity_weight, clean).in_format(format_to_write(output))
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, format_to_write(output).budget_suffix)
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
     if rows is not None:
         if dry_run or plot is not None:

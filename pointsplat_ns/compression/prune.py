@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import PruneRequest
-from pointsplat_ns.errors import BudgetError, DataError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
@@ -24,7 +24,6 @@ from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
-    check_size,
     cut_sh,
     energy_lost,
     need_usable,
@@ -63,8 +62,6 @@ def prune_scene(
     """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of a
     compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met, SceneError if no
     Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
-    if len(dense) == 0:
-        raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
     views = views or ViewSource(dense)
     full, notes = _with_sh(dense, request.sh, views, progress)
@@ -185,7 +182,7 @@ def _for_size(
     ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, largest_within
 
-    limit = FileLimit(format_to_write(budget.suffix), check_size(budget, len(dense)))
+    limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
     try:
         reference = DenseReference(dense, views.compared())
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])

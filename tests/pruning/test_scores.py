@@ -13,7 +13,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.pruning.coverage import mass_shares
-from pointsplat_ns.pruning.scores import paper_score
+from pointsplat_ns.pruning.paper import paper_score
 
 SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
 
