@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 _PUBLIC = {
     "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
-    "pointsplat_ns.compression.compact": ("Compacted",),
+    "pointsplat_ns.compression.compacted": ("Compacted",),
     "pointsplat_ns.levels.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.placing": ("place",),

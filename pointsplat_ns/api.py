@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
-from pointsplat_ns.compression.compact import Compacted
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (

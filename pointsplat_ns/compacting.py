@@ -21,7 +21,7 @@ from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.compression.requests import Effort

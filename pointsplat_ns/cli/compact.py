@@ -35,7 +35,7 @@ from pointsplat_ns.cli.scene_options import (
 )
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
     from pointsplat_ns.gaussians import Gaussians
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pointsplat_ns.compression.compact import Compacted
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.looking.closeness import Closeness

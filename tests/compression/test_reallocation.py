@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from making import FewViews
-from pointsplat_ns.compression.reallocation import APART, reallocated, split
+from pointsplat_ns.compression.photo_repair import reallocated, split
 from pointsplat_ns.geometry.transforms import rotation_matrices
 
 
@@ -23,10 +23,10 @@ def test_halves_lie_on_both_sides_along_the_longest_axis(hollow_ball):
         first, second = (3 + (whole == 1), 5 + (whole == 1))
         apart = (halves.means[first] - halves.means[second]) / 2
         size = scene.scales[whole, axis].exp()
-        assert torch.allclose(apart, APART * size * matrices[whole, :, axis], atol=1e-6)
+        assert torch.allclose(apart, 0.5 * size * matrices[whole, :, axis], atol=1e-6)
         assert torch.allclose((halves.means[first] + halves.means[second]) / 2, scene.means[whole], atol=1e-6)
         change = halves.scales[first] - scene.scales[whole]
-        assert float(change[axis]) == pytest.approx(math.log(math.sqrt(1 - APART**2)), abs=1e-6)
+        assert float(change[axis]) == pytest.approx(math.log(math.sqrt(1 - 0.5**2)), abs=1e-6)
         assert torch.equal(halves.scales[first], halves.scales[second])
         assert halves.scales[first].isfinite().tolist() == scene.scales[whole].isfinite().tolist()
 
