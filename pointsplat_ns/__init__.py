@@ -75,46 +75,12 @@ _PUBLIC = {
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
-    "BudgetError",
-    "Compacted",
-    "DataError",
-    "Gaussians",
-    "Levels",
-    "MissingPackageError",
-    "PointSplatError",
-    "SceneError",
-    "SceneInfo",
-    "SceneResult",
-    "Tradeoff",
-    "TrainedRefiner",
-    "View",
-    "Views",
-    "compact",
-    "compact_folder",
-    "dataset_views",
-    "example_room",
-    "info",
-    "load",
-    "load_refiner",
-    "lod",
-    "lpips",
-    "measure_tradeoff",
-    "open_viewer",
-    "place",
-    "plot_comparison",
-    "plot_distributions",
-    "plot_views",
-    "prune",
-    "psnr",
-    "rasterization",
-    "refine",
-    "render",
-    "render_path",
-    "sample_views",
-    "save",
-    "ssim",
-    "write_page",
-]
+    "BudgetError", "Compacted", "DataError", "Gaussians", "Levels", "MissingPackageError", "PointSplatError",
+    "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "compact",
+    "compact_folder", "dataset_views", "example_room", "info", "load", "load_refiner", "lod", "lpips",
+    "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_distributions", "plot_views", "prune",
+    "psnr", "rasterization", "refine", "render", "render_path", "sample_views", "save", "ssim", "write_page",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
@@ -126,4 +92,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__version__"]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
+from pointsplat_ns.compacting import Looking, Source, compact_source, goal_of, log, prune_source, read_source
 from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
@@ -153,7 +153,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    _, pruned, _, _ = prune_source(scene, request, views, resolution, up, data, progress)
+    _, pruned, _, _ = prune_source(scene, request, Looking(views, resolution, up, data), progress)
     return pruned
 
 
@@ -232,7 +232,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result, _ = compact_source(scene, request, goal, views, resolution, up, data, progress)
+    _, result, _ = compact_source(scene, request, goal, Looking(views, resolution, up, data), progress)
     return result
 
 
@@ -299,7 +299,7 @@ def lod(
             else:
                 check_stream_folder(Path(folder), force, viewer.files if viewer else ())
             stack.enter_context(claimed_folder(Path(folder)))
-        dense, view_source = read_source(scene, views, resolution, up, data)
+        dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
         page = None
         if viewer is not None and folder is not None:
@@ -349,7 +349,7 @@ def plot_views(
         >>> "of the visible content" in text
         True
     """
-    dense, source = read_source(scene, views, resolution, up, data)
+    dense, source = read_source(scene, Looking(views, resolution, up, data))
     return draw_views(dense.detach().to("cpu"), source, path)
 
 

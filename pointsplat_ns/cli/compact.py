@@ -141,7 +141,7 @@ def compact(
             shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
-    from pointsplat_ns.compacting import compact_source, goal_of
+    from pointsplat_ns.compacting import Looking, compact_source, goal_of
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
@@ -158,7 +158,7 @@ def compact(
     goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
-            scene, request, goal, poses, resolution, up, data, progress=True, compared=True
+            scene, request, goal, Looking(poses, resolution, up, data), progress=True, compared=True
         )
     if not dry_run:
         ps.save(result.scene, output, progress=True)

@@ -101,7 +101,7 @@ def prune(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compacting import prune_source
+    from pointsplat_ns.compacting import Looking, prune_source
     from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.errors import SceneError
@@ -135,7 +135,7 @@ def prune(
     need_no_folder_options(scene, jobs, shard)
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
-            scene, request, poses, resolution, up, data, progress=True, compared=True
+            scene, request, Looking(poses, resolution, up, data), progress=True, compared=True
         )
     if not dry_run:
         ps.save(small, output, progress=True)
