@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import time
 from dataclasses import dataclass, field
@@ -15,7 +14,6 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views
@@ -25,6 +23,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.compression.requests import Effort
+    from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.targets import Targets
 
 logger = logging.getLogger("pointsplat_ns")
@@ -150,10 +149,10 @@ def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]
     """Read the dense scene, and make its source of views. Raises SceneError if a file is missing or damaged, or the
     scene is a ``pointsplat`` run, which is pruned already; and DataError if a file of cameras is not usable, or most of
     them see nothing of the scene."""
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
+
     views, data = looking.views, looking.data
     if data is not None:
-        from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
-
         need_named_data(scene if views is None or without_poses(views) else views, data)
     poses: Path | str | None = None if views is None else NO_POSES
     if isinstance(views, (str, Path)) and not without_poses(views):
@@ -167,8 +166,7 @@ def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]
         poses = views if is_camera_file(views) else NO_POSES
     dense, found, _ = read_found(scene, poses)
     given = views if isinstance(views, Views) else found
-    read = functools.partial(_dataset_views, data=data)
-    return dense, ViewSource(dense, given, looking.run_of(scene), read, looking.size, up=looking.upward)
+    return dense, view_source(dense, given, looking.run_of(scene), data, looking.size, looking.upward)
 
 
 def _training_photos(dense: Gaussians, scene: Source, data: str | Path | None) -> Photos:
@@ -187,10 +185,3 @@ def log(lines: tuple[str, ...]) -> None:
     """Log lines of text at level INFO."""
     for line in lines:
         logger.info("%s", line)
-
-
-def _dataset_views(run: Path | str, data: Path | str | None = None) -> Views:
-    """The poses of a run's dataset. Read by the plugin, which is not imported before."""
-    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-
-    return dataset_views(run, data=data)

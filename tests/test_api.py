@@ -4,6 +4,7 @@ import doctest
 import inspect
 import logging
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -88,7 +89,8 @@ def test_every_public_function_documents_its_arguments_and_has_types(name):
     text, signature = inspect.getdoc(function) or "", inspect.signature(function)
     for parameter in signature.parameters.values():
         assert parameter.annotation is not inspect.Parameter.empty, f"{name}({parameter.name})"
-        assert f" {parameter.name}: " in text or f", {parameter.name}: " in text, f"{name}({parameter.name})"
+        # several arguments may share a line: "views, resolution: as for prune"
+        assert re.search(rf"\b{parameter.name}(, \w+)*: ", text), f"{name}({parameter.name})"
     assert signature.return_annotation is not inspect.Signature.empty
 
 

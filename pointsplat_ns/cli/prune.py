@@ -116,8 +116,8 @@ def prune(
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
-            keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, resolution=resolution,
-            data=data, shard=shard, force=force,
+            request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data, shard=shard,
+            force=force,
         )  # fmt: skip
     need_no_folder_options(scene, None, shard)
     check_poses(poses)
