@@ -25,17 +25,19 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised, size_factors
-from pointsplat_ns.compression.reallocation import reallocated
 from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.pictures import in_unit_range
+from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.metrics import MOST_PSNR, psnr_of
+from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.views import spread_indices
+from pointsplat_ns.views import Views, spread_indices
 
 Photos = Sequence[Example]
 """Photos with the views that they show; read when they are asked for. Photos of uint8 count in 255ths."""
@@ -54,30 +56,13 @@ class PhotoSettings:
     far."""
     last_factor: float = 0.05
     """Factor on the first rates at the last step. They fall along a half cosine."""
-    unseen_every: int = 8
-    """One photo of this many takes part in no step."""
-    most_unseen: int = 6
-    """Largest number of those photos."""
     dense_every: int = 8
     """One step of this many takes a render of the dense scene. With every fourth, held-out photos lose 0.2 dB and views
     between photos 0.3 dB (vr_project); sampled views, which may be far from photos, gain 1.1 dB."""
-    dense_views: int = 32
-    """Number of the views of these renders."""
     moves: int = 5
-    """Number of times that Gaussians are moved (:mod:`~pointsplat_ns.compression.reallocation`) to where the gradients
+    """Number of times that Gaussians are moved (:func:`reallocated`) to where the gradients
     by their means, in units of their size, are largest. At a tenth, held-out photos gain 0.5 dB (fox), 0.2 dB
     (vr_project) and nothing (kitchen, whose photos are blurred)."""
-    moved_share: float = 0.2
-    """Share of the Gaussians that is split each time."""
-    moved_until: float = 0.5
-    """Share of the steps that is done the last time."""
-    checks: int = 8
-    """Number of times that the scene is compared with photos."""
-    step_side: int = 200
-    """Longer side of the pictures of a step, pixels, at least: of larger photos every k-th pixel is taken. In the time
-    of a step on whole photos there are three on these, and held-out photos gain 0.4 dB (fox, vr_project)."""
-    compared_side: int = sides_of(*RESOLUTION)[1]
-    """The same for comparisons."""
 
 
 PHOTO_REPAIR = PhotoSettings()
@@ -130,7 +115,7 @@ def photo_repair(
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
     run, checked = OptimisationRun(budget), 0
-    unseen = list(range(0, len(photos), PHOTO_REPAIR.unseen_every))[: PHOTO_REPAIR.most_unseen]
+    unseen = list(range(0, len(photos), 8))[:6]
     used = sorted({*range(len(photos))} - {*unseen})
     compared = unseen + [used[place] for place in spread_indices(len(used), len(unseen))]
     best, before = scene, _psnr(scene, photos, compared)
@@ -138,8 +123,8 @@ def photo_repair(
 
     def compare(scene: Gaussians) -> None:
         nonlocal best, after, checked
-        if int(run.done * PHOTO_REPAIR.checks) > checked:
-            checked = int(run.done * PHOTO_REPAIR.checks)
+        if int(8 * run.done) > checked:  # eight times
+            checked = int(8 * run.done)
             if (psnr := _psnr(scene, photos, compared)) > after:
                 best, after = scene, psnr
 
@@ -158,13 +143,14 @@ def _scenes(
         def choose(scene: Gaussians, adam: Adam = adam) -> tuple[float, Tensor]:
             return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
 
-        until = PHOTO_REPAIR.moved_until * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
+        # the last time when half of the steps are done
+        until = 0.5 * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
         for stepped in optimised(scene, adam, examples, choose):
             yield (scene := stepped)
             if run.done >= until:
                 break
         pull = adam.root_mean_square("means") * size_factors(scene, adam.reach)[:, 0]
-        scene = reallocated(scene, pull, PHOTO_REPAIR.moved_share, views.for_merging())
+        scene = reallocated(scene, pull, 0.2, views.for_merging())
 
 
 @torch.no_grad()
@@ -172,7 +158,7 @@ def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     """Mean PSNR in some photos, dB, in every k-th of their pixels."""
     psnrs = []
     for index in indices:
-        view, photo, mask = every_kth_pixel(photos[index], PHOTO_REPAIR.compared_side, scene.device)
+        view, photo, mask = every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device)
         apart, counted = render(scene, view).double() - photo, 1.0
         if mask is not None:
             apart, counted = apart * mask, float(mask.double().mean())
@@ -182,13 +168,15 @@ def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos in random order, each once before any is repeated, and renders of the dense scene; without end."""
-    generator, count = random.Random(0), PHOTO_REPAIR.dense_views
-    places = islice(views.sampled(count=count), count)
+    generator = random.Random(0)
+    places = islice(views.sampled(count=32), 32)
     renders = cycle(Example(view, render(dense, view)) for view in places)  # which keeps them
     order = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):
         if step % PHOTO_REPAIR.dense_every:
-            yield every_kth_pixel(photos[next(order)], PHOTO_REPAIR.step_side, dense.device, generator)
+            # In the time of a step on whole photos there are three on 200 pixels, and held-out photos gain 0.4 dB (fox,
+            # vr_project).
+            yield every_kth_pixel(photos[next(order)], 200, dense.device, generator)
         else:
             with torch.no_grad():
                 example = next(renders)
@@ -215,3 +203,39 @@ def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: 
     K[1, 1] /= k
     height, width = image.shape[:2]
     return Example(replace(view, K=K, width=width, height=height, eps2d=view.eps2d / k**2), image, mask)
+
+
+@torch.no_grad()
+def reallocated(scene: Gaussians, pull: Tensor, share: float, views: Views | Sampler) -> Gaussians:
+    """Split Gaussians, and merge the scene to as many as there were.
+
+    Args:
+        scene: K Gaussians; not changed.
+        pull: (K,), those with the largest are split.
+        share: of the Gaussians that are split, in [0, 1].
+        views: views that weigh errors of merging, as for :func:`pointsplat_ns.pruning.prune`.
+
+    Returns:
+        K Gaussians; ``scene`` if fewer than K are finite.
+    """
+    strongest = pull.argsort(descending=True)[: round(share * len(scene))]
+    doubled = split(scene, strongest)
+    if int(doubled.usable().sum()) < len(scene):
+        return scene
+    return prune(doubled, len(scene), "merge", views)
+
+
+def split(scene: Gaussians, indices: Tensor) -> Gaussians:
+    """A scene (K) in which some Gaussians (n,) are replaced by two halves each, side by side along their longest axis:
+    (K + n), halves last. Both together have the second moments of the whole."""
+    others = torch.ones(len(scene), dtype=torch.bool, device=scene.device).index_fill(0, indices, False)
+    whole = scene[indices]
+    longest = whole.scales.argmax(dim=1, keepdim=True)  # [n, 1]
+    axes = rotation_matrices(whole.quats).gather(2, longest[:, :, None].expand(-1, 3, 1))[:, :, 0]
+    apart = 0.5  # distance of each half from the centre, in the largest standard deviations
+    step = apart * whole.scales.gather(1, longest).exp() * axes
+    shrinking = torch.zeros_like(whole.scales).scatter_(1, longest, math.log(math.sqrt(1 - apart**2)))
+    doubled = scene[torch.cat([others.nonzero()[:, 0], indices, indices])]
+    rest = len(scene) - len(indices)
+    means = torch.cat([doubled.means[:rest], whole.means + step, whole.means - step])
+    return doubled.replace(means=means, scales=torch.cat([doubled.scales[:rest], *[whole.scales + shrinking] * 2]))
