@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.compression.requests import Effort
-    from pointsplat_ns.tradeoff.targets import Targets
+    from pointsplat_ns.tradeoff.search import Targets
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -116,9 +116,9 @@ def compact_source(
                 check_photos(dense, photos, str(scene))
             result = compact_scene(dense, request, source, report, photos)
         else:
-            from pointsplat_ns.tradeoff.finding import find_scene
-            from pointsplat_ns.tradeoff.measure import subject_of
-            from pointsplat_ns.tradeoff.settings import repairs_of
+            from pointsplat_ns.tradeoff.making import subject_of
+            from pointsplat_ns.tradeoff.points import repairs_of
+            from pointsplat_ns.tradeoff.search import find_scene
 
             size, upward = parse_resolution(resolution), up_named(up)
             run = run_of(scene, views)
@@ -140,7 +140,7 @@ def goal_of(
     """The goal of a search, from a PSNR against the dense scene's renders in dB, the time of a frame in milliseconds
     and the size of a file of a format in units of 10^6 bytes; None if no target is given. Raises BudgetError if a
     target is not positive, or an option was given that a search decides, such as ``keep``."""
-    from pointsplat_ns.tradeoff.targets import targets_of
+    from pointsplat_ns.tradeoff.search import targets_of
 
     pruning, photos = request.prune, request.photos is not None
     targets = targets_of(db, ms, mb, keep, pruning.sh, pruning.clean, request.repair.seconds, photos)

@@ -32,10 +32,9 @@ from pointsplat_ns.scene_folder import (
 )
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.finding import find_scene
-from pointsplat_ns.tradeoff.measure import subject_of
-from pointsplat_ns.tradeoff.settings import Repair, repairs_of
-from pointsplat_ns.tradeoff.targets import Targets, targets_of
+from pointsplat_ns.tradeoff.making import subject_of
+from pointsplat_ns.tradeoff.points import Repair, repairs_of
+from pointsplat_ns.tradeoff.search import Targets, find_scene, targets_of
 
 
 @normal_mode

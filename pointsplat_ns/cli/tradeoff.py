@@ -81,8 +81,8 @@ def tradeoff(
     """
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
-    from pointsplat_ns.tradeoff.front import next_best
-    from pointsplat_ns.tradeoff.results import SWEEP_FILES
+    from pointsplat_ns.tradeoff.points import RESULTS
+    from pointsplat_ns.tradeoff.recommend import next_best
 
     check_poses(poses)
     folder = output or output_beside(scene, "tradeoff").with_suffix("")
@@ -93,7 +93,7 @@ def tradeoff(
             force=force, progress=True,
         )  # fmt: skip
     if json_output:
-        print_json({"output": folder, **json.loads((folder / SWEEP_FILES.json).read_text("utf-8"))})
+        print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})
         return
     _print_table(found)
     for note in found.notes:
@@ -103,7 +103,7 @@ def tradeoff(
     best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
     if best.command:
         print(f"$ {best.command}")
-    print(f"{folder}: table and pictures; open {folder / SWEEP_FILES.page}")
+    print(f"{folder}: table and pictures; open {folder / RESULTS['page']}")
 
 
 def _print_table(found: Tradeoff) -> None:

@@ -11,7 +11,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.tradeoff import judging
+from pointsplat_ns.tradeoff import measuring
 
 FEW = ("--views", "2", "--repairs", "none")
 
@@ -25,7 +25,7 @@ def views():
 def ply(tmp_path, views, plain_page, no_lpips, monkeypatch) -> Path:
     """A room of 400 Gaussians, looked at from three views; repairs take two steps, and times are as counts are."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views[:count])
-    monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
+    monkeypatch.setattr(measuring, "_timed", lambda scene, view: 1e-5 * len(scene))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
     return tmp_path / "room.ply"
@@ -47,7 +47,7 @@ def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(erro
     def failing(*_):
         raise error("now")
 
-    monkeypatch.setattr(judging, "_timed", failing)
+    monkeypatch.setattr(measuring, "_timed", failing)
     for folder in (tmp_path / "new", tmp_path / "old"):
         (tmp_path / "old" / "pictures").mkdir(parents=True, exist_ok=True)
         (tmp_path / "old" / "pictures" / "mine.png").touch()
@@ -63,7 +63,7 @@ def test_a_quality_is_reached_and_what_is_cheaper_is_said(ply, tmp_path, capsys)
     content = json.loads((tmp_path / "found" / "tradeoff.json").read_text())
     [found] = [point for point in content["points"] if point["key"] == content["recommended"]]
     assert found["against_dense"]["psnr"] >= 25
-    assert "scenes tried; the next cheaper," in said and "dB where 25 are wanted" in said
+    assert "scenes tried; the next cheaper," in said and "dB, less than 25 dB" in said
 
 
 @pytest.mark.parametrize(
