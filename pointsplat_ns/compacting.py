@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,13 +65,13 @@ def prune_source(
     up: str | None = None,
     data: DataInput = None,
     progress: bool | Progress = False,
-    compared: bool = False,
+    compared: str = "",
 ) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
     """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
 
     Returns:
-        The dense scene, the smaller scene, the seconds of pruning, and if ``compared`` how close both are; None if
-        there are no views.
+        The dense scene, the smaller scene, the seconds of pruning, and how close both are, if ``compared`` is the
+        suffix of the file to be written; None if there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
     from pointsplat_ns.compression.quality import quality_of_pruned
@@ -80,7 +82,7 @@ def prune_source(
         pruned = prune_scene(dense, request, source, report)
         seconds, quality = time.perf_counter() - start, None
         if compared:
-            quality = quality_of_pruned(dense, pruned, source)
+            quality = _as_written(lambda scene: quality_of_pruned(dense, scene, pruned, source), pruned.scene, compared)
     log(pruned.notes)
     return dense, pruned.scene, seconds, quality
 
@@ -95,14 +97,14 @@ def compact_source(
     up: str | None = None,
     data: DataInput = None,
     progress: bool | Progress = False,
-    compared: bool = False,
+    compared: str = "",
 ) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
     """Read a scene and compact it, or search for a goal; verdicts and notes are logged. Arguments as of
     :func:`pointsplat_ns.compact`. A search uses only the method and the refiner of the request, and decides the rest.
 
     Returns:
-        The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
-        uses; None if there are no views.
+        The dense scene, the result, and how close both are at full size, in the views that no repair uses, if
+        ``compared`` is the suffix of the file to be written; None if there are no views.
     """
     from pointsplat_ns.compression.quality import quality_if_seen
 
@@ -124,9 +126,24 @@ def compact_source(
             run = run_of(scene, views)
             subject = subject_of(dense, run, source.given, request.refiner, goal.suffix, size, upward, data)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
-        quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
+        quality = None
+        if compared:
+            quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), result.scene, compared)
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
     return dense, result, quality
+
+
+def _as_written(
+    quality_of: Callable[[Gaussians], FullSizeQuality | None], scene: Gaussians, suffix: str
+) -> FullSizeQuality | None:
+    """Quality of a scene; where it does not differ from the dense scene, that of its file, which may round numbers."""
+    from pointsplat_ns.tradeoff.making import through_file
+
+    quality = quality_of(scene)
+    if quality is not None and quality.psnr == math.inf:
+        written = through_file(scene, suffix)[1]
+        quality = quality if written is scene else quality_of(written)
+    return quality
 
 
 def goal_of(

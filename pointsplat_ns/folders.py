@@ -234,7 +234,7 @@ def _pruned(
     if (whole := _kept_whole(dense, request, source)) is not None:
         return whole
     pruned = prune_scene(dense, request.in_format(format_like(path)), source)
-    quality = quality_of_pruned(dense, pruned, source)
+    quality = quality_of_pruned(dense, pruned.scene, pruned, source)
     return SmallerScene(pruned.scene, None if quality is None else quality.psnr, source.missing[2:-1])
 
 

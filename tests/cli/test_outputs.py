@@ -17,29 +17,30 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.io.outputs import claimed, claimed_folder
 
 FILES = (
-    "prune gone.ply -o OUT.ply",
-    "prune gone.ply -o a.ply --plot OUT.png",
-    "compact gone.ply -o OUT.spz",
-    "compact gone.ply -o a.ply --picture OUT.png",
-    "compact gone.ply --dry-run --html OUT.html",
-    "convert gone.ply OUT.sog",
-    "export gone -o OUT.splat",
-    "info gone.ply --views OUT.png",
-    "render gone.ply -o OUT.mp4",
+    "prune damaged.ply -o OUT.ply",
+    "prune damaged.ply -o a.ply --plot OUT.png",
+    "compact damaged.ply -o OUT.spz",
+    "compact damaged.ply -o a.ply --picture OUT.png",
+    "compact damaged.ply --dry-run --html OUT.html",
+    "convert damaged.ply OUT.sog",
+    "export damaged.ply -o OUT.splat",
+    "info damaged.ply --views OUT.png",
+    "render damaged.ply -o OUT.mp4",
 )
 
 FOLDERS = (
-    "lod gone.ply -o OUT",
-    "tradeoff gone.ply -o OUT",
-    "render gone.ply -o OUT",
+    "lod damaged.ply -o OUT",
+    "tradeoff damaged.ply -o OUT",
+    "render damaged.ply -o OUT",
     "demo --output OUT",
 )
-"""Commands that fail at their work, because there is no such scene, unless they find before that they cannot write."""
+"""Commands that fail at their work, because the scene is damaged, unless they find before that they cannot write."""
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    Path("damaged.ply").write_text("ply")
     return tmp_path
 
 
@@ -99,7 +100,7 @@ def test_a_file_that_appears_during_the_work_is_replaced_by_force_alone(links, m
     monkeypatch.setattr(compacting, "prune_source", prune)
     main(words.split())
     assert len(ps.load("small.ply")) == 20
-    assert sorted(path.name for path in Path.cwd().iterdir()) == ["room.ply", "small.ply"]
+    assert sorted(path.name for path in Path.cwd().iterdir()) == ["damaged.ply", "room.ply", "small.ply"]
 
 
 @pytest.mark.parametrize(

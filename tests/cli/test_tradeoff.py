@@ -76,4 +76,5 @@ def test_a_quality_is_reached_and_what_is_cheaper_is_said(ply, tmp_path, capsys)
     ],
 )
 def test_numbers_that_mean_nothing_are_refused_before_the_scene_is_read(tmp_path, capsys, arguments, said):
-    assert said in refusal(capsys, tmp_path / "gone.ply", *arguments)
+    (tmp_path / "damaged.ply").touch()
+    assert said in refusal(capsys, tmp_path / "damaged.ply", *arguments)

@@ -85,6 +85,18 @@ def test_an_interrupted_sweep_keeps_what_it_measured_and_goes_on(new_sweep, tmp_
     assert not any("interrupted" in note for note in resumed.notes)
 
 
+def test_the_bar_names_the_point_and_moves_with_every_view(new_sweep, tmp_path):
+    heard: dict[str, list[float]] = {}
+    new_sweep(tmp_path, progress=lambda what, share: heard.setdefault(what, [0.0]).append(share)).run(TENTH)
+    for number in (1, 2):
+        assert heard[f"point {number} of 2: comparing"] == [0, *(pytest.approx(view / 3) for view in (1, 2, 3))]
+        assert heard[f"point {number} of 2: timing frames"] == [
+            0,
+            *(pytest.approx(frame / 9) for frame in range(1, 10)),
+        ]
+    assert any(what.startswith("point 2 of 2: by merge") for what in heard)
+
+
 def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkeypatch):
     from pointsplat_ns.compression import compact
 
