@@ -35,13 +35,6 @@ def run(*args) -> None:
     main([str(a) for a in args])
 
 
-def refusal(capsys, *args) -> str:
-    with pytest.raises(SystemExit) as ended:
-        run("tradeoff", *args)
-    assert ended.value.code == 1
-    return capsys.readouterr().err
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_a_sweep_that_ends_before_its_first_point_leaves_nothing_of_its_own(error, ply, tmp_path, monkeypatch):
     def failing(*_):
@@ -64,17 +57,3 @@ def test_a_quality_is_reached_and_what_is_cheaper_is_said(ply, tmp_path, capsys)
     [found] = [point for point in content["points"] if point["key"] == content["recommended"]]
     assert found["against_dense"]["psnr"] >= 25
     assert "scenes tried; the next cheaper," in said and "dB, less than 25 dB" in said
-
-
-@pytest.mark.parametrize(
-    "arguments, said",
-    [
-        (("--target-db", "0"), "--target-db is 0; expected a positive number"),
-        (("--keep", "much"), "keep is 'much'"),
-        (("--by", "magic"), "no method is called 'magic'"),
-        (("--within", "-1"), "a loss of -1 dB"),
-    ],
-)
-def test_numbers_that_mean_nothing_are_refused_before_the_scene_is_read(tmp_path, capsys, arguments, said):
-    (tmp_path / "damaged.ply").touch()
-    assert said in refusal(capsys, tmp_path / "damaged.ply", *arguments)

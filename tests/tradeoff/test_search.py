@@ -32,12 +32,6 @@ def test_it_decides_count_degree_and_repair_from_the_scene():
     assert (chosen.sh_degree, chosen.repair) == (0, "none")
 
 
-def test_what_the_next_cheaper_would_have_missed_is_said():
-    found = search(Trade(), Targets(db=30.0)).run()
-    assert "dB against the dense scene's renders in 3 views, " in found.why
-    assert "dB, less than 30 dB" in found.why and "the next cheaper" in found.why
-
-
 def test_all_targets_hold_at_once():
     targets = Targets(db=30.0, ms=20.0, mb=3.0)
     assert targets.missed(search(Trade(), targets).run().point) == []
