@@ -21,7 +21,6 @@ from pointsplat_ns.cli.printing import (
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compact import Compacted
-    from pointsplat_ns.compression.trained_refiner import TrainedRefiner
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -112,6 +111,7 @@ def compact(
     options.need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import compact_source, goal_of
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
+    from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
 
@@ -121,7 +121,7 @@ def compact(
     options.claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     kind = format_to_write(output)
-    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
+    request = CompactRequest.of(refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     request = replace(request, prune=request.prune.in_format(kind))
     goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
@@ -156,15 +156,6 @@ def compact(
     if html is not None:
         print(f"{html}: {written_size(html)}, to fly through in a browser")
     end_if_interrupted(result.interrupted)
-
-
-def _loaded(refiner: Path | None) -> TrainedRefiner | None:
-    """The trained refiner at a path; None for none."""
-    if refiner is None:
-        return None
-    from pointsplat_ns.compression.trained_refiner import refiner_at
-
-    return refiner_at(refiner)
 
 
 def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float, up: str | None) -> None:

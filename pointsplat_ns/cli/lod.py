@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.printing import print_json
+from pointsplat_ns.cli.printing import print_json, psnr_text
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
@@ -94,8 +94,8 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"{len(level.scene):,}",
                 f"{100 * len(level.scene) / len(made.dense):.3g} %",
                 three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
-                f"{near.psnr:.1f}" if near else "-",
-                f"{near.worst:.1f}" if near else "-",
+                psnr_text(near.psnr if near else None),
+                psnr_text(near.worst if near else None),
                 f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
                 f"{level.seconds:.1f}",
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -86,6 +87,11 @@ def print_result(
         what = f"nothing is {'merged' if by == 'merge' else 'pruned'}, all {before:,} Gaussians fit as they are"
     print(f"{place}: {what}, {size}, in {seconds_text(seconds)}")
     print(quality or "not compared with the dense scene: nothing of it is visible")
+
+
+def psnr_text(psnr: float | None, digits: int = 1) -> str:
+    """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was compared."""
+    return "-" if psnr is None else "same" if psnr == math.inf else f"{psnr:.{digits}f}"
 
 
 def written_size(where: Path) -> str:

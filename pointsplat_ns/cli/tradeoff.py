@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.printing import print_json
+from pointsplat_ns.cli.printing import print_json, psnr_text
 from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.tradeoff.points import ImageMetrics, Tradeoff
+    from pointsplat_ns.tradeoff.points import Tradeoff
 
 
 def tradeoff(
@@ -105,26 +104,14 @@ def _print_table(found: Tradeoff) -> None:
                 f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
                 three_digits(point.frame_ms),
                 "-" if point.fill is None else f"{point.fill:.1f}",
-                _psnr(point.against_dense),
-                *([_psnr(point.against_photos)] if photos else []),
+                psnr_text(point.against_dense.psnr, 2),
+                *([psnr_text(point.against_photos and point.against_photos.psnr, 2)] if photos else []),
             )
         )
+    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill", "dB,\nrenders"]
     print_table(
-        (
-            "",
-            "Gaussians",
-            "MB",
-            "times as fast",
-            "ms a\nframe",
-            "fill",
-            "dB,\nrenders",
-            *(["dB,\nphotos"] if photos else []),
-        ),
+        (*columns, *(["dB,\nphotos"] if photos else [])),
         rows,
         "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
         "drawn per pixel; dB of PSNR",
     )
-
-
-def _psnr(quality: ImageMetrics | None) -> str:
-    return "-" if quality is None else "same" if quality.psnr == math.inf else f"{quality.psnr:.2f}"

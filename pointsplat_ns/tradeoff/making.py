@@ -1,13 +1,15 @@
-"""Makes the scene of a setting like its command."""
+"""A scene to be measured, the settings to measure, and how the scene of a setting is made: like its command."""
 
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 import shlex
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +18,23 @@ from torch import Tensor
 
 from pointsplat_ns.compression.compact import Compacted, compact_scene
 from pointsplat_ns.compression.photo_repair import Photos
+from pointsplat_ns.compression.posed_scene import NO_POSES, read_found, without_poses
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import usable_part
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.runs import may_be_run
-from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.io.runs import may_be_run, name_of
+from pointsplat_ns.looking.sizes import parse_resolution, size_text
+from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
-from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.pruning import Keep, method_named, parse_keep, ply_bytes, resolve_keep
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, Setting
+from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, REPAIRS, Repair, Setting
 from pointsplat_ns.views import Views
 
 HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
@@ -113,6 +118,66 @@ def subject_of(
         dense, run or Path("scene.ply"), "scene", lambda: ViewSource(dense, views, run, read, resolution, up=up),
         held_out, refiner, suffix, resolution=resolution,
     )  # fmt: skip
+
+
+def subject_at(
+    path: Path,
+    poses: str | Path | None,
+    resolution: tuple[int, int] | str | None,
+    up: str | None,
+    data: str | Path | None,
+) -> Subject:
+    """The scene at a path, with the options on views that its commands repeat."""
+    size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
+    dense, given, file = read_found(path, poses)
+    subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
+    named = {
+        "--poses": NO_POSES if sampled else file,
+        "--resolution": None if size is None else size_text(size),
+        "--data": data,
+    }
+    words = [word for option, value in named.items() if value is not None for word in (option, str(value))]
+    words += [] if up is None else [f"--up={up}"]
+    return replace(subject, path=path, name=name_of(path), words=tuple(words))
+
+
+def check_options(
+    keep: tuple[Keep | str, ...],
+    by: tuple[str, ...],
+    sh: tuple[str, ...],
+    repairs: tuple[str, ...],
+    within: float,
+    views: int,
+) -> tuple[Repair, ...]:
+    """The repairs, each once, in the order of :data:`REPAIRS`. Raises PointSplatError if an option is invalid."""
+    if not 0 < within < math.inf:
+        raise PointSplatError(f"a loss of {within:g} dB; expected a positive number, such as 0.5")
+    if views < 1:
+        raise PointSplatError(f"{views} views; expected at least one")
+    if not keep or not by:
+        raise PointSplatError("no budget or no method is named; expected at least one of each, such as 10%, merge")
+    for budget in keep:
+        if isinstance(budget, str):
+            parse_keep(budget)
+    for method in by:
+        method_named(method)
+    for name, given, known in (("sh", sh, ("all", "0", "1", "2", "3")), ("repairs", repairs, REPAIRS)):
+        if not given or not {*given} <= {*known}:
+            raise PointSplatError(f"{name}: {', '.join(given) or 'empty'}; expected some of {', '.join(known)}")
+    return tuple(repair for repair in REPAIRS if repair in repairs)
+
+
+def settings_of(
+    dense: Gaussians, keep: Sequence[Keep | str], by: Sequence[str], sh: Sequence[str], repairs: Sequence[Repair]
+) -> list[Setting]:
+    """All combinations of options for a scene, each once. Raises BudgetError if a budget does not fit it."""
+    degrees = [dense.sh_degree if some == "all" else min(int(some), dense.sh_degree) for some in sh]
+    ways = itertools.product(by, degrees, keep, repairs)
+    counted = (
+        Setting(resolve_keep(len(dense), budget, degree, dense.traits), degree, repair, method)
+        for method, degree, budget, repair in ways
+    )
+    return list(dict.fromkeys(counted))
 
 
 @dataclass(frozen=True, eq=False)

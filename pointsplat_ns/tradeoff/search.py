@@ -285,8 +285,8 @@ class TargetSearch:
 def find_scene(
     subject: Subject, targets: Targets, by: str, repairs: tuple[Repair, ...], progress: Progress
 ) -> Compacted:
-    """Find the cheapest scene that meets targets by :class:`TargetSearch`, with a
-    method of pruning and the repairs to try.
+    """Find the cheapest scene that meets targets by :class:`TargetSearch`, with a method of pruning and the repairs to
+    try, without a folder of measurements: ``compact --target-db``.
 
     Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
     reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
-from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
+from pointsplat_ns.compression.posed_scene import check_photos
+from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.pictures import write_picture
-from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.io.scene import save
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.looking.sizes import parse_resolution, size_text
-from pointsplat_ns.looking.upright import up_named
+from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, training_photos
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
+from pointsplat_ns.pruning import Keep
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.making import Subject, subject_of
+from pointsplat_ns.tradeoff.making import Subject, check_options, settings_of, subject_at
 from pointsplat_ns.tradeoff.measuring import Measurer, busy_note, machine_text
 from pointsplat_ns.tradeoff.points import (
     DENSE,
@@ -46,7 +42,7 @@ from pointsplat_ns.tradeoff.points import (
     write_table,
 )
 from pointsplat_ns.tradeoff.recommend import recommend
-from pointsplat_ns.tradeoff.search import Targets, TargetSearch, targets_of
+from pointsplat_ns.tradeoff.search import Targets, TargetSearch, psnr_text, targets_of
 from pointsplat_ns.views import spread_indices
 
 logger = logging.getLogger("pointsplat_ns")
@@ -128,12 +124,12 @@ def measure_tradeoff(
         True
     """
     budgets = KEEP if keep is None else tuple(keep)
-    tried = _checked(budgets, tuple(by), tuple(sh), tuple(repairs), within, views)
+    tried = check_options(budgets, tuple(by), tuple(sh), tuple(repairs), within, views)
     targets = targets_of(target_db, target_ms, target_mb, keep, " ".join(sh), photos="photos" in tried)
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
     with claimed_folder(folder), progress_bar(progress) as report:
-        subject = _subject_at(path, poses, resolution, up, data)
+        subject = subject_at(path, poses, resolution, up, data)
         if "photos" in tried:
             training = training_photos(path, data)
             check_photos(subject.dense, training, path)
@@ -142,66 +138,6 @@ def measure_tradeoff(
         if targets is not None:
             return sweep.search(targets, by[0], tried)
         return sweep.run(settings_of(subject.dense, budgets, by, sh, tried))
-
-
-def _checked(
-    keep: tuple[Keep | str, ...],
-    by: tuple[str, ...],
-    sh: tuple[str, ...],
-    repairs: tuple[str, ...],
-    within: float,
-    views: int,
-) -> tuple[Repair, ...]:
-    """The repairs, each once, in the order of :data:`REPAIRS`. Raises PointSplatError if an option is invalid."""
-    if not 0 < within < math.inf:
-        raise PointSplatError(f"a loss of {within:g} dB; expected a positive number, such as 0.5")
-    if views < 1:
-        raise PointSplatError(f"{views} views; expected at least one")
-    if not keep or not by:
-        raise PointSplatError("no budget or no method is named; expected at least one of each, such as 10%, merge")
-    for budget in keep:
-        if isinstance(budget, str):
-            parse_keep(budget)
-    for method in by:
-        method_named(method)
-    for name, given, known in (("sh", sh, ("all", "0", "1", "2", "3")), ("repairs", repairs, REPAIRS)):
-        if not given or not {*given} <= {*known}:
-            raise PointSplatError(f"{name}: {', '.join(given) or 'empty'}; expected some of {', '.join(known)}")
-    return tuple(repair for repair in REPAIRS if repair in repairs)
-
-
-def settings_of(
-    dense: Gaussians, keep: Sequence[Keep | str], by: Sequence[str], sh: Sequence[str], repairs: Sequence[Repair]
-) -> list[Setting]:
-    """All combinations of options for a scene, each once. Raises BudgetError if a budget does not fit it."""
-    degrees = [dense.sh_degree if some == "all" else min(int(some), dense.sh_degree) for some in sh]
-    ways = itertools.product(by, degrees, keep, repairs)
-    counted = (
-        Setting(resolve_keep(len(dense), budget, degree, dense.traits), degree, repair, method)
-        for method, degree, budget, repair in ways
-    )
-    return list(dict.fromkeys(counted))
-
-
-def _subject_at(
-    path: Path,
-    poses: str | Path | None,
-    resolution: tuple[int, int] | str | None,
-    up: str | None,
-    data: str | Path | None,
-) -> Subject:
-    """The scene at a path, with the options on views that its commands repeat."""
-    size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
-    dense, given, file = read_found(path, poses)
-    subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
-    named = {
-        "--poses": NO_POSES if sampled else file,
-        "--resolution": None if size is None else size_text(size),
-        "--data": data,
-    }
-    words = [word for option, value in named.items() if value is not None for word in (option, str(value))]
-    words += [] if up is None else [f"--up={up}"]
-    return replace(subject, path=path, name=name_of(path), words=tuple(words))
 
 
 class Sweep:
@@ -375,6 +311,6 @@ class Sweep:
             keep_scene(self._frame, scene, point, self.folder)
         self.points[setting] = point
         write_points(self.result(), self.identity, self.folder)
-        figures = [] if setting == self.dense else [f"{point.against_dense.psnr:.1f} dB against the dense scene"]
+        figures = [] if setting == self.dense else [f"{psnr_text(point.against_dense.psnr)} the dense scene"]
         figures += [] if point.against_photos is None else [f"{point.against_photos.psnr:.2f} dB against photos"]
         logger.info("%s: %s", point.label, ", ".join([*figures, bytes_text(point.bytes)]))

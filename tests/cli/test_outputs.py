@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -124,15 +123,6 @@ def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words
     assert said.endswith("; the scene was written before, to small.ply") != dry
 
 
-HEEDED = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-signal.signal(signal.SIGHUP, signal.SIG_DFL)
-"""
-"""Where the tests run in the background of a shell or by nohup, SIGINT or SIGHUP is ignored, also by what they start,
-unless told otherwise."""
-
-
 WRITES = {
     "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
     "room.spz": ("convert", "room.ply", "room.spz"),
@@ -143,34 +133,6 @@ WRITES = {
     "first.png": ("render", "room.ply", "-o", "first.png", "--width", "16", "--height", "12"),
 }
 """Commands by a file that they write."""
-
-
-@pytest.fixture()
-def start(tmp_path):
-    """A function that starts a script in a process group of its own and waits until ``count`` trainings run."""
-    started: list[subprocess.Popen[str]] = []
-
-    def run(script: str, count: int) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-c", HEEDED + script, str(tmp_path)],
-            start_new_session=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        deadline = time.monotonic() + 120
-        while len(list(tmp_path.glob("*.pid"))) < count:
-            assert process.poll() is None, process.communicate()[1]
-            assert time.monotonic() < deadline, "nothing started"
-            time.sleep(0.05)
-        return process
-
-    yield run
-    for process in started:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 @pytest.mark.parametrize("name", WRITES)

@@ -18,9 +18,8 @@ from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff import measuring
-from pointsplat_ns.tradeoff.making import Subject, make
+from pointsplat_ns.tradeoff.making import Subject, make, settings_of
 from pointsplat_ns.tradeoff.points import DENSE, REPAIRS, RESULTS, Setting, Tradeoff, picture_path, write_points
-from pointsplat_ns.tradeoff.table import settings_of
 from trades import point
 
 TENTH = [Setting(40, 1)]
