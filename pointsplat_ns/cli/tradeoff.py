@@ -105,7 +105,7 @@ def _print_table(found: Tradeoff) -> None:
                 three_digits(point.frame_ms),
                 "-" if point.fill is None else f"{point.fill:.1f}",
                 psnr_text(point.against_dense.psnr, 2),
-                *([psnr_text(point.against_photos and point.against_photos.psnr, 2)] if photos else []),
+                *([psnr_text(point.against_photos.psnr if point.against_photos else None, 2)] if photos else []),
             )
         )
     columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill", "dB,\nrenders"]

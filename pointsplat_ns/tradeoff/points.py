@@ -189,15 +189,21 @@ def _rows(sweep: Tradeoff) -> list[dict[str, Any]]:
     return [{**dataclasses.asdict(point), "speed": speed_of(point, dense)._asdict()} for point in sweep.points]
 
 
+def check_folder(folder: Path) -> None:
+    """Raise a SceneError if a folder has results without the JSON to resume from."""
+    for path in (folder / RESULTS["table"], folder / RESULTS["page"]):
+        if path.exists() and not (folder / RESULTS["json"]).exists():
+            raise SceneError(
+                f"{path}: exists already, without {RESULTS['json']} to resume from; name another folder, or overwrite "
+                "it with --force"
+            )
+
+
 def read_points(folder: Path, identity: Mapping[str, str | int]) -> dict[Setting, Point]:
     """The points of an earlier call by setting. The file is not trusted; there are none if there is no file. Raises
-    SceneError if it is damaged, missing beside other results or of another version, or its points are of another
-    identity."""
+    SceneError if it is damaged or of another version, or its points are of another identity."""
     path, mend = folder / RESULTS["json"], "name another folder, or start over with --force"
     if not path.exists():
-        for name in RESULTS.values():
-            if (folder / name).exists():
-                raise SceneError(f"{folder / name}: exists already, without {path.name} to resume from; {mend}")
         return {}
     try:
         content = json.loads(read_text(path, 16_000_000))  # a thousand points take one megabyte

@@ -36,6 +36,7 @@ from pointsplat_ns.tradeoff.points import (
     Repair,
     Setting,
     Tradeoff,
+    check_folder,
     picture_path,
     read_points,
     write_points,
@@ -129,6 +130,8 @@ def measure_tradeoff(
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
     with claimed_folder(folder), progress_bar(progress) as report:
+        if not force:
+            check_folder(folder)
         subject = subject_at(path, poses, resolution, up, data)
         if "photos" in tried:
             training = training_photos(path, data)

@@ -173,10 +173,10 @@ def test_points_of_another_scene_are_refused_and_keys_are_not_taken_from_files(n
     assert {point.key for point in new_sweep(tmp_path).points.values()} == {"dense", "10pct_sh1"}
 
 
-def test_results_without_points_are_not_overwritten(new_sweep, tmp_path):
+def test_results_without_points_are_not_overwritten(tmp_path):
     (tmp_path / RESULTS["table"]).write_text("precious")
     with pytest.raises(SceneError, match="exists already, without tradeoff.json"):
-        new_sweep(tmp_path)
+        ps.measure_tradeoff(tmp_path / "gone.ply", tmp_path)
 
 
 @pytest.mark.parametrize(
