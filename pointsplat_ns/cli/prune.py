@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
@@ -14,10 +13,6 @@ from pointsplat_ns.cli.printing import (
     print_result,
     scene_result,
 )
-
-if TYPE_CHECKING:
-    from pointsplat_ns.compression.requests import PruneRequest
-    from pointsplat_ns.io.ply import PlyRows
 
 
 def prune(
@@ -70,11 +65,14 @@ def prune(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import prune_source
-    from pointsplat_ns.compression.prune_file import rows_to_prune
+    from pointsplat_ns.compression.prune_file import prune_file, rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
-    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
+    from pointsplat_ns.io.ply import PlyRows
     from pointsplat_ns.io.scene import is_folder_of_scenes
+    from pointsplat_ns.looking.sizes import parse_resolution
+    from pointsplat_ns.looking.upright import up_named
+    from pointsplat_ns.system.progress import progress_bar
     from pointsplat_ns.system.threads import fixed_threads
 
     if is_folder_of_scenes(scene):
@@ -93,61 +91,40 @@ def prune(
     written = None if dry_run else output
     options.claim_outputs(written, force, plot)
     request = PruneRequest(keep, by, sh, opacity_weight, clean).in_format(format_to_write(output))
-    rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
-    if rows is not None:
-        if dry_run or plot is not None:
-            raise SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
-        with fixed_threads(threads):
-            _prune_in_parts(rows, output, request, memory, jobs, poses, resolution, up, json_output)
-        return
-    options.need_no_folder_options(scene, jobs, shard)
+    limit = None if memory is None else 1e6 * memory
+    rows = rows_to_prune(scene, request, limit)
+    dense: ps.Gaussians | None = None
+    small: ps.Gaussians | PlyRows | None
     with fixed_threads(threads):
-        dense, small, seconds, quality = prune_source(
-            scene, request, poses, resolution, up, data, progress=True, compared=format_to_write(output).budget_suffix
-        )
-    if not dry_run:
-        ps.save(small, output, progress=True)
-    if plot is not None:
-        with options.scene_written(written):
-            ps.plot_distributions({"before": dense, "after": small}, plot)
+        if rows is None:
+            options.need_no_folder_options(scene, jobs, shard)
+            suffix = format_to_write(output).budget_suffix
+            dense, pruned, seconds, quality = prune_source(
+                scene, request, poses, resolution, up, data, progress=True, compared=suffix
+            )
+            small, before = pruned, len(dense)
+            if not dry_run:
+                ps.save(pruned, output, progress=True)
+            if plot is not None:
+                with options.scene_written(written):
+                    ps.plot_distributions({"before": dense, "after": pruned}, plot)
+        elif dry_run or plot is not None:
+            raise ps.SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
+        else:
+            processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
+            with progress_bar() as report:
+                before, seconds = prune_file(
+                    rows, output, request, limit, poses, size, up_named(up), report, jobs=processes
+                )
+            small, quality = PlyRows.open(output), None
+    assert small is not None
     if json_output:
         compared = asdict(quality) if quality else {"psnr": None}
-        print_json({**scene_result(len(dense), small, seconds, written), **compared, "plot": plot})
+        print_json({**scene_result(before, small, seconds, written), **compared, "plot": plot})
         return
-    print_result(by, [], len(dense), small, seconds, written, quality)
-    if verbose:
+    unknown = "not compared with the dense scene: it does not fit into memory"
+    print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
+    if verbose and dense is not None and isinstance(small, ps.Gaussians):
         print_distributions(dense, small)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")
-
-
-def _prune_in_parts(
-    rows: PlyRows,
-    output: Path,
-    request: PruneRequest,
-    memory: float | None,
-    jobs: int | None,
-    poses: Path | None,
-    resolution: str | None,
-    up: str | None,
-    json_output: bool,
-) -> None:
-    """Prune a scene that does not fit into memory, and print the result."""
-    from pointsplat_ns.compression.prune_file import prune_file
-    from pointsplat_ns.io.ply import PlyRows
-    from pointsplat_ns.looking.sizes import parse_resolution
-    from pointsplat_ns.looking.upright import up_named
-    from pointsplat_ns.system.progress import progress_bar
-
-    size, limit = parse_resolution(resolution), None if memory is None else 1e6 * memory
-    with progress_bar() as report:
-        before, seconds = prune_file(
-            rows, output, request, limit, poses, size, up_named(up), report, jobs=1 if jobs is None else jobs
-        )
-    small = PlyRows.open(output)
-    assert small is not None
-    if json_output:
-        print_json({**scene_result(before, small, seconds, output), "psnr": None, "plot": None})
-        return
-    unknown = "not compared with the dense scene: it does not fit into memory"
-    print_result(request.by, [], before, small, seconds, output, unknown)
