@@ -37,7 +37,7 @@ from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.targets import targets_of
+from pointsplat_ns.tradeoff.search import targets_of
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
