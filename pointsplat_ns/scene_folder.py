@@ -24,7 +24,6 @@ from typing import Any, Literal
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import (
     content_hash,
@@ -34,11 +33,11 @@ from pointsplat_ns.io.files import (
     read_text,
     replacing,
     require_memory,
+    write_csv,
     write_json,
 )
 from pointsplat_ns.io.formats import format_like, format_to_read, format_to_write
-from pointsplat_ns.io.scene import read_scene, save_as
-from pointsplat_ns.io.source import source_file, source_parts
+from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs

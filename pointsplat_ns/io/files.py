@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
 import json
@@ -12,7 +13,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -300,6 +301,25 @@ def _without_infinities(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_without_infinities(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+_FORMULA = tuple("=+-@\t\r\n\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SIGN}\N{FULLWIDTH HYPHEN-MINUS}") + (
+    "\N{FULLWIDTH COMMERCIAL AT}",
+)
+"""Signs by which spreadsheets tell a formula, which may send what stands in other cells (OWASP, CSV injection)."""
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person named.
+
+    A text that a spreadsheet would take for a formula gets a leading apostrophe, as a file's name may be a stranger's.
+    """
+    with replacing(path, named=False) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            texts = {name for name, value in row.items() if isinstance(value, str) and value.startswith(_FORMULA)}
+            writer.writerow({name: f"'{value}" if name in texts else value for name, value in row.items()})
 
 
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:

@@ -13,8 +13,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of
-from pointsplat_ns.io.scene import save
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import save, source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES
-from pointsplat_ns.io.files import one_line, read_text, write_json
+from pointsplat_ns.io.files import one_line, read_text, write_csv, write_json
 from pointsplat_ns.tradeoff.points import ImageMetrics, Point, Speed, Tradeoff, restored_point, speed_of
 from pointsplat_ns.tradeoff.settings import Setting, setting_of
 

@@ -7,7 +7,7 @@ import pytest
 import pointsplat_ns as ps
 from making import normal_scene
 from pointsplat_ns.folders import convert_folder
-from pointsplat_ns.io.csv_tables import write_csv
+from pointsplat_ns.io.files import write_csv
 
 
 @pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\N{FULLWIDTH EQUALS SIGN}1"])

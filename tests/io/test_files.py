@@ -14,8 +14,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import never_replaced, replacing
-from pointsplat_ns.io.scene import save
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import save, source_file
 
 
 def write(path: Path, text: str = "new") -> None:

@@ -11,8 +11,7 @@ from pathlib import Path, PurePosixPath
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, photo_order, rigid
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
-from pointsplat_ns.io.camera_files.inria import inria_cameras
-from pointsplat_ns.io.camera_files.nerfstudio import exported_cameras, nerfstudio_cameras
+from pointsplat_ns.io.camera_files.json_cameras import exported_cameras, inria_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.io.runs import RUN_FILES, read_transforms
