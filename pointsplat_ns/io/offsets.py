@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pointsplat_ns.gaussians import Gaussians, Offset, Traits
+from pointsplat_ns.gaussians import Gaussians, Offset
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -45,35 +45,6 @@ def rounded_centre(means: NDArray[np.float64]) -> Offset:
     unit = 10.0 ** math.floor(math.log10(extent)) if extent > 1e-300 else 0.0
     x, y, z = (np.rint(centre / unit) * unit if unit else centre).tolist()
     return x, y, z
-
-
-def has_doubles(rows: np.dtype) -> bool:
-    """Whether rows of a PLY have x, y or z as doubles."""
-    return any(name in (rows.names or ()) and rows[name].newbyteorder("=") == np.float64 for name in "xyz")
-
-
-def positions_of(rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """The positions (N, 3) in rows of a PLY, float64."""
-    return np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
-
-
-def shift_of(rows: NDArray[np.void]) -> Offset | None:
-    """What is subtracted from the positions of a 3DGS PLY before they become float32, by some of its rows (N,); None
-    if they have no doubles, or need none."""
-    if not has_doubles(rows.dtype):
-        return None
-    names = [name for name in ("scale_0", "scale_1", "scale_2") if name in (rows.dtype.names or ())]
-    return offset_for(positions_of(rows), np.stack([rows[name].astype(np.float64) for name in names], axis=1))
-
-
-def with_shift(traits: Traits, shift: Offset | None, path: Path | None) -> Traits:
-    """The traits of a scene from whose positions ``shift`` is subtracted, which is logged if there is a ``path``."""
-    if shift is None:
-        return traits
-    x, y, z = (a + b for a, b in zip(traits.offset or (0.0, 0.0, 0.0), shift, strict=True))
-    if path is not None:
-        logger.info("%s: positions are doubles; their offset %s is kept beside the scene", path, offset_text((x, y, z)))
-    return traits._replace(offset=(x, y, z))
 
 
 def warn_if_far(scene: Gaussians, path: Path | str) -> None:

@@ -75,11 +75,12 @@ def read_scene(path: Path | str) -> Gaussians:
     """
     path = Path(path)
     found = _found(path)
+    run = found if isinstance(found, Run) else _run_around(path, found)
     if isinstance(found, Run):
-        scene, run = read_checkpoint(found.checkpoint), found
+        scene = read_checkpoint(found.checkpoint)
     else:
         assert found.read is not None
-        scene, run = found.read(path), _run_around(path, found)
+        scene = found.read(path)
         warn_if_far(scene, path)
     return scene if run is None else scene.replace(antialiased=run.rasterize_mode == "antialiased")
 
