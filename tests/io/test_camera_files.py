@@ -13,7 +13,8 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
-from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views, registry
+from pointsplat_ns.io import camera_files
+from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views
 from pointsplat_ns.io.camera_files.cameras import CameraLimits
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, written
 
@@ -406,6 +407,6 @@ def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypa
     monkeypatch.setattr(cameras, "CAMERA_LIMITS", CameraLimits(cameras=3))
     with pytest.raises(ps.DataError, match="12 cameras; expected 1 to 3"):
         read_views(path)
-    monkeypatch.setattr(registry, "CAMERA_LIMITS", CameraLimits(file_bytes=10))
+    monkeypatch.setattr(camera_files, "CAMERA_LIMITS", CameraLimits(file_bytes=10))
     with pytest.raises(ps.DataError, match="expected cameras of at most"):
         read_views(path)
