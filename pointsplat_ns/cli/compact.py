@@ -160,7 +160,7 @@ def compact(
             scene, request, goal, poses, resolution, up, data, progress=True, compared=True
         )
     if not dry_run:
-        ps.save(result.scene, output, progress=True)
+        ps.save(result.scene, output, progress=True, overwrite=True)
     with scene_written(written):
         shown = None if picture is None else ps.plot_comparison(dense, result, picture)
         if html is not None:

@@ -138,7 +138,7 @@ def prune(
             scene, request, poses, resolution, up, data, progress=True, compared=True
         )
     if not dry_run:
-        ps.save(small, output, progress=True)
+        ps.save(small, output, progress=True, overwrite=True)
     if plot is not None:
         with scene_written(written):
             ps.plot_distributions({"before": dense, "after": small}, plot)

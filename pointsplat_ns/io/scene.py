@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, keep_usable, logger, one_line, require_file
+from pointsplat_ns.io.files import content_hash, keep_usable, logger, never_replaced, one_line, require_file
 from pointsplat_ns.io.formats import (
     READABLE,
     SOG_META,
@@ -131,22 +131,23 @@ def kind_of(path: Path | str) -> str:
     return f"checkpoint of {opened.program}" + ("" if opened.step is None else f", step {opened.step}")
 
 
-def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) -> None:
+def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:
     """Write a scene in the format that the path's name asks for.
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
     ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
     glTF, exact to rounding. Gaussians that cannot be drawn (NaN, or Inf where it is not
-    valid) are left out, and their number is logged. The write is atomic and replaces an existing file.
+    valid) are left out, and their number is logged. The file appears whole or not at all.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,
             with K = (d+1)^2 - 1 and 12 bytes of unused normals.
         path: a path that ends in one of these. Missing folders are created.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
+        overwrite: whether an existing file is replaced.
 
     Raises:
-        SceneError: if the path has another suffix, is a folder, or cannot be written.
+        SceneError: if the path has another suffix, is a folder, cannot be written, or exists and is not to be replaced.
 
     Example:
         >>> import tempfile
@@ -157,8 +158,11 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
         100
     """
     path = Path(path)
-    with progress_bar(progress) as report:
-        save_as(format_to_write(path), scene, path, report)
+    kind = format_to_write(path)
+    if path.is_file() and not overwrite:
+        raise SceneError(f"{path}: exists already; name another file, or replace it with overwrite=True")
+    with progress_bar(progress) as report, nullcontext() if overwrite else never_replaced(path):
+        save_as(kind, scene, path, report)
 
 
 def save_as(

@@ -136,7 +136,7 @@ def _search(sweep: Sweep, targets: Targets, force: bool) -> Tradeoff:
             raise
     output = sweep.folder / f"{sweep.subject.name}_{found.point.key}.ply"
     if not output.exists() or force:
-        save(sweep.scene(found.setting), output)
+        save(sweep.scene(found.setting), output, overwrite=True)
     return sweep.finish(found.point, f"{found.why}; written to {output}")
 
 

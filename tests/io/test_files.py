@@ -90,6 +90,24 @@ def test_a_file_that_is_not_to_be_replaced_may_be_again_afterwards(tmp_path):
     assert path.read_text() == "newer"
 
 
+@pytest.mark.parametrize("name", ["a.ply", "meta.json"])
+def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
+    path = tmp_path / name
+    ps.save(cloud(3), path)
+    with pytest.raises(SceneError, match="exists already; name another file, or replace it with overwrite=True"):
+        ps.save(cloud(4), path)
+    assert len(ps.load(path)) == 3
+    ps.save(cloud(4), path, overwrite=True)
+    assert len(ps.load(path)) == 4
+
+
+def test_a_file_that_appears_while_a_scene_is_written_stays(tmp_path):
+    path = tmp_path / "a.spz"
+    with pytest.raises(SceneError, match="appeared meanwhile"):
+        ps.save(cloud(4), path, progress=lambda *told: path.write_bytes(b"of others"))
+    assert path.read_bytes() == b"of others"
+
+
 def test_of_a_file_it_is_the_hash_of_its_bytes(tmp_path):
     path = tmp_path / "room.ply"
     ps.save(normal_scene(5), path)

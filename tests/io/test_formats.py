@@ -24,7 +24,7 @@ def name_of(suffix):
 def test_the_size_of_a_file_is_known_to_the_byte(tmp_path, suffix):
     bytes_of = format_named(suffix).bytes_of
     for n, degree in ((0, 0), (1, 3), (255, 1), (256, 2), (257, 0), (1001, 3)):
-        ps.save(normal_scene(n, degree), tmp_path / f"a{suffix}")
+        ps.save(normal_scene(n, degree), tmp_path / f"a{suffix}", overwrite=True)
         assert (tmp_path / f"a{suffix}").stat().st_size == bytes_of(n, degree)
 
 

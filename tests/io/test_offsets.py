@@ -143,7 +143,7 @@ def test_float32_that_has_lost_its_digits_is_warned_of(tmp_path, caplog):
     ps.load(tmp_path / "a.ply")
     assert "positions have lost their digits" in caplog.text
     caplog.clear()
-    ps.save(scene.replace(means=scene.means + 100), tmp_path / "a.ply")
+    ps.save(scene.replace(means=scene.means + 100), tmp_path / "a.ply", overwrite=True)
     ps.load(tmp_path / "a.ply")
     assert not caplog.records
 

@@ -146,12 +146,12 @@ def test_what_can_be_drawn_of_an_extreme_scene_is_written_and_read_back(tmp_path
     path = tmp_path / f"a{suffix}"
     usable = scene[scene.usable()]
     try:
-        ps.save(scene, path)
+        ps.save(scene, path, overwrite=True)
     except ps.SceneError as error:  # SPZ reaches to 2^23 units
         assert suffix == ".spz" and float(usable.means.abs().max()) > 2**23 - 1 and "\n" not in str(error)
         return
     again = ps.load(path)
     assert len(again) == len(usable) and all(bool(value.isfinite().all()) for value in again.tensors())
     assert suffix != ".ply" or same_bits(again, keep_usable(scene, path))
-    ps.save(again, path)  # what was read is written again
+    ps.save(again, path, overwrite=True)  # what was read is written again
     assert len(ps.load(path)) == len(again)

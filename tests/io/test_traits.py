@@ -85,7 +85,7 @@ def test_the_last_comment_of_a_ply_that_names_a_trait_counts(tmp_path, suffix, c
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", "meta.json"])
 def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
     for scene in (cloud(20), trained_so(cloud(20))):
-        ps.save(scene, named(tmp_path, suffix))
+        ps.save(scene, named(tmp_path, suffix), overwrite=True)
         back = ps.load(named(tmp_path, suffix))
         assert back.antialiased is scene.antialiased and len(back) == 20
     (tmp_path / "4.spz").write_bytes(encode_spz(trained_so(cloud(20)), version=4))
@@ -96,7 +96,7 @@ def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
 def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, suffix, caplog):
     ps.save(cloud(3, sh_degree=0), tmp_path / f"a{suffix}")
     assert not caplog.text
-    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / f"a{suffix}")
+    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / f"a{suffix}", overwrite=True)
     assert "the mark of antialiased training; .sog keeps it" in caplog.text
 
 
