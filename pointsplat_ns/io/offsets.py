@@ -16,12 +16,6 @@ from pointsplat_ns.system.tensors import DOUBLES
 SAMPLED = 4096
 """Gaussians that tell the distance and the size of a scene, at most."""
 
-_LARGEST = 1e15
-"""Coordinate of an offset, scene units; beyond it, doubles have steps of a tenth."""
-
-_FINE, _COARSE = 1 / 32, 1 / 4
-"""Steps of float32, in median sizes of Gaussians: from where on doubles get an offset, and float32 is warned of."""
-
 
 def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> Offset | None:
     """The offset of a scene whose positions float32 would round too far; None if it holds them.
@@ -33,7 +27,7 @@ def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> 
         log_scales: (N, 2) or (N, 3) natural logarithms of standard deviations in scene units.
     """
     usable = np.isfinite(means).all(axis=1) & np.isfinite(log_scales).all(axis=1)
-    if not usable.any() or _steps_a_size(means[usable], log_scales[usable]) <= _FINE:
+    if not usable.any() or _steps_a_size(means[usable], log_scales[usable]) <= 1 / 32:
         return None
     return rounded_centre(means[usable])
 
@@ -54,7 +48,7 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
         return
     means = some.means.detach().double().cpu().numpy()
     times = _steps_a_size(means, some.scales.detach().double().cpu().numpy())
-    if times > _COARSE:
+    if times > 1 / 4:
         logger.warning(
             "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the median size of a Gaussian: "
             "positions have lost their digits; export it with x, y and z as doubles, or nearer to the origin",
@@ -73,7 +67,8 @@ def offset_of_text(text: str) -> Offset | None:
         x, y, z = (float(word) for word in text.split())
     except ValueError:
         return None
-    return (x, y, z) if all(abs(value) < _LARGEST for value in (x, y, z)) else None
+    # Beyond 1e15, doubles have steps of a tenth.
+    return (x, y, z) if all(abs(value) < 1e15 for value in (x, y, z)) else None
 
 
 def from_centre(scene: Gaussians) -> Gaussians:

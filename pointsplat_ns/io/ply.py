@@ -18,7 +18,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset, Traits, sh_degree_of
-from pointsplat_ns.io.files import keep_usable, logger, one_line, require_file, require_memory
+from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
 from pointsplat_ns.io.ply_dialects import (
     COLORS,
@@ -32,6 +32,7 @@ from pointsplat_ns.io.ply_dialects import (
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
+from pointsplat_ns.io.usable import keep_usable
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""

@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, keep_usable, logger, never_replaced, one_line, require_file
+from pointsplat_ns.io.files import content_hash, logger, never_replaced, one_line, require_file
 from pointsplat_ns.io.formats import (
     READABLE,
     SOG_META,
@@ -26,6 +26,7 @@ from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.offsets import warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.io.splatfacto import checkpoint_parts, open_checkpoint, read_checkpoint
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (

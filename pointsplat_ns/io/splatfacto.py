@@ -18,7 +18,8 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, logger, one_line, read_text, require_file, require_memory
+from pointsplat_ns.io.files import logger, one_line, read_text, require_file, require_memory
+from pointsplat_ns.io.usable import keep_usable
 
 EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"
 

@@ -23,9 +23,9 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import usable_part
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
+from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes

@@ -14,9 +14,9 @@ from hypothesis.extra import numpy as arrays
 
 import pointsplat_ns as ps
 from making import normal_scene, same, same_bits
-from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.formats.sog_stream import Node, read_sog_stream, write_sog_stream
 from pointsplat_ns.io.scene import kind_of
+from pointsplat_ns.io.usable import keep_usable
 
 FINE, COARSE = 300, 60
 
