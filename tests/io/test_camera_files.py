@@ -242,13 +242,9 @@ def test_distortion_is_left_out_and_said_to_be(model, number, extra, tmp_path, c
     [
         ("SIMPLE_PINHOLE", "50 30 20", (50, 50), (30, 20)),
         ("PINHOLE", "50 51 30 20", (50, 51), (30, 20)),
-        ("SIMPLE_RADIAL", "50 30 20 0.1", (50, 50), (30, 20)),
         ("RADIAL", "50 30 20 0.1 0.2", (50, 50), (30, 20)),
         ("FULL_OPENCV", "50 51 30 20 1 2 3 4 5 6 7 8", (50, 51), (30, 20)),
-        ("FOV", "50 51 30 20 1", (50, 51), (30, 20)),
-        ("SIMPLE_RADIAL_FISHEYE", "50 30 20 1", (50, 50), (30, 20)),
         ("RADIAL_FISHEYE", "50 30 20 1 2", (50, 50), (30, 20)),
-        ("THIN_PRISM_FISHEYE", "50 51 30 20 1 2 3 4 5 6 7 8", (50, 51), (30, 20)),
     ],
 )
 def test_focal_lengths_and_principal_point_of_each_model_of_colmap(model, params, focal, centre, tmp_path):

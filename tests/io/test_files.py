@@ -1,5 +1,6 @@
 """Files: found, opened and replaced."""
 
+import csv
 import hashlib
 import os
 import shutil
@@ -11,9 +12,10 @@ import pytest
 import pointsplat_ns as ps
 from making import cloud, normal_scene
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.folders import convert_folder
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import never_replaced, replacing
+from pointsplat_ns.io.files import never_replaced, replacing, write_csv
 from pointsplat_ns.io.scene import save, source_file
 
 
@@ -188,3 +190,30 @@ def test_a_run_is_named_by_its_experiment_wherever_the_search_begins(make_run, t
     assert [scene.name for scene in find_scenes(tmp_path)] == ["outputs/kitchen"]
     for folder in (run.parent, run.parents[1]):
         assert [scene.name for scene in find_scenes(folder)] == ["kitchen"]
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\N{FULLWIDTH EQUALS SIGN}1"])
+def test_a_text_that_is_a_formula_gets_an_apostrophe(text, tmp_path):
+    write_csv([{"name": text, "loss": -1.5, "note": "a=b", "none": None}], tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as stream:
+        assert [*csv.DictReader(stream)] == [{"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}]
+
+
+def test_the_table_of_a_folder_holds_no_formula_of_a_file_name(tmp_path):
+    name = '=HYPERLINK("http:evil.example")'
+    ps.save(normal_scene(4), tmp_path / "in" / f"{name}.ply")
+    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
+    assert result.name == name
+    with (tmp_path / "out" / "scenes.csv").open(newline="") as stream:
+        assert [row["name"] for row in csv.DictReader(stream)] == [f"'{name}"]
+
+
+def test_links_among_the_tables_of_a_folder_are_not_written_through(tmp_path):
+    ps.save(normal_scene(4), tmp_path / "in" / "a.ply")
+    (tmp_path / "diary.txt").write_text("precious")
+    (tmp_path / "out").mkdir()
+    for name in ("scenes.csv", "a.ply.json"):
+        (tmp_path / "out" / name).symlink_to(tmp_path / "diary.txt")
+    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
+    assert result.status == "done" and (tmp_path / "diary.txt").read_text() == "precious"
+    assert not any(path.is_symlink() for path in (tmp_path / "out").iterdir())

@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
@@ -53,17 +54,12 @@ def test_a_sog_folder_is_read_by_both_names_and_equals_the_file(tmp_path):
 
 
 def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):
-    names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(72)), "opacity"]
-    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
-    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    rows = np.arange(2 * len(names), dtype="<f4").reshape(2, -1) / 64  # log-scales that can be drawn
-    (tmp_path / "a.ply").write_bytes(head.encode() + rows.tobytes())
+    columns = columns_of(cloud(2, 0, 3)) | {f"f_rest_{i}": np.full(2, i / 64, np.float32) for i in range(72)}
+    write_columns(tmp_path / "a.ply", columns)
     scene = ps.load(tmp_path / "a.ply")
     assert scene.sh_degree == 3 and "SH degree 4, read up to degree 3" in caplog.text
-    for channel in range(3):
-        first = names.index(f"f_rest_{24 * channel}")
-        assert scene.features_rest[1, :, channel].tolist() == rows[1, first : first + 15].tolist()
+    wanted = np.arange(72).reshape(3, 24)[:, :15] / 64
+    assert np.array_equal(scene.features_rest[1].T.numpy(), wanted)
 
 
 REAL = {

@@ -149,18 +149,6 @@ def test_an_antialiased_scene_is_drawn_so_from_any_view():
         assert same_bits(kept, expected)
 
 
-def test_gradients_are_those_of_the_antialiased_picture():
-    scene = ball(60, 1, log_size=-4.0).to(torch.float64)
-    views = ps.sample_views(scene, 1, 24, 16)
-    found = []
-    for antialiased, mode in ((True, "classic"), (False, "antialiased")):
-        leaves = scene.map(lambda value: value.clone().requires_grad_())
-        picture = ps.render(leaves.replace(antialiased=antialiased), dataclasses.replace(views, rasterize_mode=mode))
-        picture.square().sum().backward()
-        found.append([value.grad for value in leaves.tensors()])
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
 def test_a_run_says_how_it_was_trained(trained_walls, tmp_path):
     for name, antialiased in (("wall-a", False), ("wall-b", True)):
         run = run_of(trained_walls, name)
