@@ -23,10 +23,10 @@ from pointsplat_ns.io.ply import PlyRows
 UTM = (451_234.6, 5_412_345.7, 312.4)
 
 
-def with_doubles(scene, path, origin=UTM, order="<", text=False):
+def with_doubles(scene, path, origin=UTM, order="<", text=False, comments=()):
     """Write a PLY whose x, y and z are doubles about an origin, and return them, float64."""
     means = scene.means.double().numpy() + np.array(origin)
-    write_columns(path, columns_of(scene) | dict(zip("xyz", means.T, strict=True)), text, order)
+    write_columns(path, columns_of(scene) | dict(zip("xyz", means.T, strict=True)), text, order, comments)
     return means
 
 
@@ -45,6 +45,11 @@ def test_doubles_keep_their_digits_beside_an_offset(tmp_path, caplog, order, tex
     assert all(abs(a - b) < 2 for a, b in zip(back.offset, UTM, strict=True))
     assert caplog.text.count("positions are doubles; their offset") == 1
     assert torch.equal(back.features_dc, scene.features_dc)
+
+
+def test_an_offset_in_a_comment_adds_to_that_of_doubles(tmp_path):
+    means = with_doubles(cloud(300), tmp_path / "a.ply", comments=["Offset: 100 20 3"])
+    assert np.abs(absolute(ps.load(tmp_path / "a.ply")) - means - (100, 20, 3)).max() < 1e-6
 
 
 def test_doubles_near_the_origin_get_no_offset(tmp_path):
