@@ -25,8 +25,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
-from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.folder import check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.levels.stream import Chunks, check_stream_folder

@@ -131,7 +131,7 @@ def compact(
             scene, request, targets, Looking(poses, resolution, up, data), progress=True, compared=kind.budget_suffix
         )
     if not dry_run:
-        ps.save(result.scene, output, progress=True)
+        ps.save(result.scene, output, progress=True, overwrite=True)
     with options.scene_written(written):
         shown = None if picture is None else ps.plot_comparison(dense, result, picture)
         if html is not None:

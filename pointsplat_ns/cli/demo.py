@@ -68,7 +68,7 @@ def write_example(path: Path, force: bool) -> None:
 
     claim_outputs(path, force)
     scene = ps.example_room()
-    ps.save(scene, path)
+    ps.save(scene, path, overwrite=True)
     print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
 
 
@@ -78,7 +78,7 @@ def compact_example(output: Path) -> list[Row]:
 
     dense, small = output / "example.ply", output / "example_compact.ply"
     page, pictures, result = output / "example.html", output / "example.png", output / "compact.json"
-    ps.save(ps.example_room(), dense)
+    ps.save(ps.example_room(), dense, overwrite=True)
     run(
         f"Make the room that ships small: {DEMO.keep} of its Gaussians, merged and repaired.",
         ["pointsplat", "compact", dense, "--keep", DEMO.keep, "-o", small, "--picture", pictures, "--html", page]

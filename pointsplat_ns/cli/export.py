@@ -35,7 +35,7 @@ def export(
     options.claim_outputs(output, force)
     start = time.perf_counter()
     exported = ps.load(run, scene, data)
-    ps.save(exported, output, progress=True)
+    ps.save(exported, output, progress=True, overwrite=True)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(None, exported, seconds, output))

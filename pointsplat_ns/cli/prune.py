@@ -104,7 +104,7 @@ def prune(
             )
             small, before = pruned, len(dense)
             if not dry_run:
-                ps.save(pruned, output, progress=True)
+                ps.save(pruned, output, progress=True, overwrite=True)
             if plot is not None:
                 with options.scene_written(written):
                     ps.plot_distributions({"before": dense, "after": pruned}, plot)

@@ -25,9 +25,9 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import usable_part
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import may_be_run, name_of
+from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource

@@ -12,9 +12,8 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES
-from pointsplat_ns.io.files import one_line, read_text, write_json
+from pointsplat_ns.io.files import one_line, read_text, write_csv, write_json
 from pointsplat_ns.pruning import method_named
 
 Repair = Literal["none", "refiner", "quick", "thorough", "photos"]

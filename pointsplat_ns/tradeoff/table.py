@@ -16,8 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.pictures import write_picture
-from pointsplat_ns.io.scene import save
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import save, source_file
 from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, training_photos
@@ -222,7 +221,7 @@ class Sweep:
                 raise
         output = self.folder / f"{self.subject.name}_{found.point.key}.ply"
         if not output.exists() or self.force:
-            save(measurer.made(found.setting, self.progress).scene, output)
+            save(measurer.made(found.setting, self.progress).scene, output, overwrite=True)
         return self.finish(found.point, f"{found.why}; written to {output}", str(targets))
 
     @contextmanager
