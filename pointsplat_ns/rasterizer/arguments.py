@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
+from pointsplat_ns.rasterizer.constants import QUALITIES
 
 
 def check_tensors(
@@ -83,7 +83,7 @@ def check_options(
     eps2d: float,
     render_mode: str,
     rasterize_mode: str,
-    quality: str | Quality,
+    quality: str,
     memory_budget: int,
 ) -> None:
     """Raise a ValueError that names the argument if a number or name has no meaning."""
@@ -98,8 +98,7 @@ def check_options(
         raise ValueError(f"memory_budget is {memory_budget}; expected a number of bytes above 0")
     _check_name("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     _check_name("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
-    if not isinstance(quality, Quality):
-        _check_name("quality", quality, tuple(QUALITIES))
+    _check_name("quality", quality, tuple(QUALITIES))
 
 
 def _check_name(argument: str, value: Any, names: tuple[str, ...]) -> None:

@@ -11,15 +11,17 @@ list does not depend on the region that it is part of.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.compiled import tiles as by_kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.ellipses import Grid
 from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface
+from pointsplat_ns.rasterizer.projection import Projected
 
 
 @dataclass
@@ -51,30 +53,37 @@ def _by_depth(depths: Tensor) -> Tensor:
 
 
 class Footprints:
-    """The 1/255 ellipses of projected Gaussians, in depth order."""
+    """The ellipses of projected Gaussians within which they are drawn, in depth order, found in torch
+    (:mod:`~pointsplat_ns.rasterizer.ellipses`) or by compiled kernels.
+
+    Args:
+        seen: M Gaussians.
+        camera_ids: (M,) int64, the image that each belongs to; None for one camera.
+        cameras: number of images.
+        width, height: of each image, pixels.
+        alpha_min: a Gaussian is not drawn where its alpha is lower.
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
+    """
 
     @torch.no_grad()
     def __init__(
         self,
-        means2d: Tensor,  # [M, 2] pixels
-        cov2d: Tensor,  # [M, 3] xx, xy, yy
-        det: Tensor,  # [M]
-        opacities: Tensor,  # [M]
-        depths: Tensor,  # [M] from any plane, which may be another for each camera
-        camera_ids: Tensor,  # [M] int64
+        seen: Projected,
+        camera_ids: Tensor | None,
         cameras: int,
         width: int,
         height: int,
         alpha_min: float = ALPHA_MIN,
-        engine: ModuleType = in_torch,  # from binning.engine_of
+        compiled: bool | None = None,
     ):
-        self.cameras, self.width, self.height = cameras, width, height
+        self.cameras, self.width, self.height, self.alpha_min = cameras, width, height, alpha_min
         self.rows, self.columns = -(-height // TILE), -(-width // TILE)  # of tiles
         self._grid = Grid(cameras, height, self.rows, self.columns)
-        self._engine = engine
-        self._ellipses = engine.ellipses_of(
-            means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._grid, alpha_min
-        )
+        shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
+        self._engine = by_kernels if KERNELS.usable_for(compiled, *shapes) else in_torch
+        order = _by_depth(seen.depth_keys.contiguous())
+        camera_ids = torch.zeros_like(seen.ids) if camera_ids is None else camera_ids
+        self._ellipses = self._engine.ellipses_of(*shapes, order, camera_ids, self._grid, alpha_min)
 
     @property
     def whole(self) -> Region:

@@ -189,15 +189,25 @@ def _why_not_loaded() -> str:
 
 
 class Kernels:
-    """Functions of a C++ file that are faster than torch, for a feature that warnings name by ``what``.
+    """Functions of a C++ file, or of those in a folder, that are faster than torch, for a feature that warnings name by
+    ``what``.
 
-    What the file declares is what Python calls. ``agree`` tells whether the functions do what torch does, on a small
-    input, so that no miscompilation passes; it may call them. All are used together or not at all.
+    What the files declare is what Python calls. ``agree``, which may be given later by :meth:`tried_by`, tells whether
+    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them. All are used
+    together or not at all.
     """
 
-    def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
-        self.what, self.source, self._agree = what, source, agree
+    def __init__(self, what: str, source: Path, agree: Callable[[], bool] | None = None):
+        self.what, self.source = what, source
+        self.files = sorted(source.glob("*.cpp")) if source.is_dir() else [source]
+        if agree is not None:
+            self.tried_by(agree)
+
+    def tried_by(self, agree: Callable[[], bool]) -> Callable[[], bool]:
+        """Set the function that tells whether the kernels do what torch does."""
+        self._agree = agree
         _TRIAL.members.append(self)
+        return agree
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
@@ -206,10 +216,9 @@ class Kernels:
 
     @functools.cached_property
     def _text(self) -> str:
-        """The text of the file, after those of the headers beside it that it includes."""
-        text = self.source.read_text("utf-8")
-        headers = [self.source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
-        return "".join([*(header.read_text("utf-8") for header in headers if header.is_file()), text])
+        """The text of the headers beside the files, and of these."""
+        headers = self.files[0].parent.glob("*.h")
+        return "".join(path.read_text("utf-8") for path in (*sorted(headers), *self.files))
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from making import assert_same_on_any_threads
-from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.compiled import colors as compiled_colors
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 
 F32, F64 = torch.float32, torch.float64
 
