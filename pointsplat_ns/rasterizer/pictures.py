@@ -135,6 +135,7 @@ def _as_torch() -> bool:
     def random(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, **FLOATS)
 
+    rasterized: Any = rasterization  # its arguments are lists here
     count, width, height = 90, 43, 38
     means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0], **FLOATS)
     shapes = random(count, 4), (0.8 * random(count, 3) - 1.5).exp(), random(count).sigmoid()
@@ -152,7 +153,7 @@ def _as_torch() -> bool:
         leaves = [value.clone().requires_grad_() for value in (*spoilt, first, rest, views)]
         colors = first if degree is None else torch.cat([leaves[4][:, None], leaves[5]], 1)
         given: Colors = (leaves[4], leaves[5]) if degree == 3 else colors
-        image, alphas, meta = rasterization(
+        image, alphas, meta = rasterized(
             *leaves[:4], given, leaves[6], K.expand(2, 3, 3), width, height, sh_degree=degree, absgrad=True,
             compiled=compiled, **options,
         )  # fmt: skip
@@ -180,12 +181,12 @@ def _as_torch() -> bool:
         flat = torch.zeros(count, 1, requires_grad=True, **FLOATS)
         options: dict[str, Any] = {"rasterize_mode": "antialiased", "compiled": False}
         view = views[:1], K[None], width, height
-        (pixels,) = torch.autograd.grad(rasterization(means, *shapes, flat, *view, **options)[0].sum(), flat)
+        (pixels,) = torch.autograd.grad(rasterized(means, *shapes, flat, *view, **options)[0].sum(), flat)
     with torch.no_grad():
-        image, alpha, _ = rasterization(means, *shapes, (first, rest), *view, sh_degree=3, **options)
+        image, alpha, _ = rasterized(means, *shapes, (first, rest), *view, sh_degree=3, **options)
         scene = Gaussians(means, shapes[1].log(), shapes[0], shapes[2].logit()[:, None], first, rest)
         camera = camera_of(views[0], K, width, height, 0.01, math.inf, 0.0, 0.3, True)
-        picture_drawn, weighed = (draw(scene, camera, ALPHA_MIN, 10**6) for draw in (picture, weights))
-    if picture_drawn is None or weighed is None:
+        ours_drawn, weighed = picture(scene, camera, ALPHA_MIN, 10**6), weights(scene, camera, ALPHA_MIN, 10**6)
+    if ours_drawn is None or weighed is None:
         return False
-    return agreement([*picture_drawn[:2], weighed], [image[0], alpha[0], pixels[:, 0]], off=1e-4, share=1e-2)
+    return agreement([*ours_drawn[:2], weighed], [image[0], alpha[0], pixels[:, 0]], off=1e-4, share=1e-2)
