@@ -1,4 +1,4 @@
-"""The public function: gsplat's signature and return shape, in pure torch."""
+"""The public function, called as gsplat's, in pure torch."""
 
 from __future__ import annotations
 
@@ -85,8 +85,9 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict]:
     """Render 3D Gaussians from C pinhole cameras, on any torch device.
 
-    Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
-    quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
+    Called as ``gsplat.rasterization`` (1.4.0). ``distributed``, ``camera_model``, ``covars`` and SH of degree 4 are not
+    taken, and ``meta`` has no lists of tiles; docs/rasterizer.md lists all differences. Differentiable in means, quats,
+    scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
     they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
     place the camera exactly, however far from the origin. Cameras are best given on the CPU, where they are computed
     with in float64: those on a GPU are fetched from it, which waits for all that it has to do.

@@ -9,10 +9,10 @@ from pointsplat_ns.geometry.transforms import (
     quaternions_of,
     rotation_components,
     rotation_matrices,
+    unit_rows,
     zero_as_identity,
 )
 from pointsplat_ns.rasterizer import rasterization, reference
-from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
 from pointsplat_ns.refiner.normalize import canonical_quats
 
 
