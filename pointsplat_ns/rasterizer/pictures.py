@@ -16,10 +16,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
 from pointsplat_ns.rasterizer.compiled import KERNELS, blending
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
-from pointsplat_ns.rasterizer.compiled.projection import camera_struct, count_meaningless, scene_struct
+from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK, TILE
 from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.rasterizer.projection import camera_of
+from pointsplat_ns.rasterizer.projection import camera_of, count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.rasterizer.rendering import Colors, rasterization
 from pointsplat_ns.rasterizer.tiles import Region

@@ -65,20 +65,9 @@ def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
 
 
 @torch.no_grad()
-def count_meaningless(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, compiled: bool | None = None
-) -> int:
-    """Number of Gaussians that no camera can draw: a NaN or infinite parameter, a negative scale or opacity.
-
-    Args:
-        means: (N, 3)
-        quats: (N, 4)
-        scales: (N, 3)
-        opacities: (N,)
-        compiled: as for :func:`~pointsplat_ns.rasterization`.
-    """
-    if KERNELS.usable_for(compiled, means, quats, scales, opacities):
-        return by_kernels.count_meaningless(means, quats, scales, opacities)
+def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
+    """Number of Gaussians (N, ...) that no camera can draw: a NaN or infinite parameter, a negative scale or
+    opacity."""
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):

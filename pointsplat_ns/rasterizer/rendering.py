@@ -165,10 +165,14 @@ def rasterization(
             rasterize_mode, channel_chunk,
         )  # fmt: skip
     opacities = opacities[:, 0] if opacities.dim() == 2 and opacities.shape[1] == 1 else opacities
-    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    check_tensors(
+        colors, sh_degree, backgrounds,
+        means=means, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks,
+    )  # fmt: skip
     check_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, render_mode, rasterize_mode, quality, memory_budget
-    )
+        width, height, near_plane, far_plane, radius_clip=radius_clip, eps2d=eps2d, render_mode=render_mode,
+        rasterize_mode=rasterize_mode, quality=quality, memory_budget=memory_budget,
+    )  # fmt: skip
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
     means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
@@ -183,7 +187,7 @@ def rasterization(
         )
         for c in range(cameras)
     ]  # fmt: skip
-    skipped = count_meaningless(means, quats, scales, opacities, compiled)
+    skipped = count_meaningless(means, quats, scales, opacities)
     channels = []
     if render_mode.startswith("RGB"):
         colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]

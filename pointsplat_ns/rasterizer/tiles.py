@@ -10,8 +10,6 @@ list does not depend on the region that it is part of.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -20,28 +18,9 @@ from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.compiled import tiles as by_kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.ellipses import Grid
-from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface
+from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface, as the next
+from pointsplat_ns.rasterizer.ellipses import TileList as TileList
 from pointsplat_ns.rasterizer.projection import Projected
-
-
-@dataclass
-class TileList:
-    """For each tile of a region the Gaussians that touch it, front to back; P pairs in all."""
-
-    gaussians: Tensor  # [P] int64, rows of the projected Gaussians, grouped by tile
-    offsets: Tensor  # [cameras * rows * columns + 1] int64, where each tile's group starts
-    places: Tensor  # [P] int64, where each pair stands when pairs are grouped by Gaussian (in depth order) instead
-    counts: Tensor  # [M] int64, pairs of each Gaussian, in depth order
-    order: Tensor  # [M] int64, the Gaussians in depth order
-    region: Region
-
-    def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel coordinates (x, y) of the centres of tiles (B,) of the region, int64."""
-        columns = self.region.columns
-        within = tiles % (self.region.rows * columns)
-        row = torch.div(within, columns, rounding_mode="floor")
-        column = within - row * columns
-        return (column + self.region.left) * TILE + TILE // 2, (row + self.region.top) * TILE + TILE // 2
 
 
 def _by_depth(depths: Tensor) -> Tensor:
@@ -115,8 +94,7 @@ class Footprints:
     @torch.no_grad()
     def tiles(self, region: Region) -> TileList:
         """Pair Gaussians with tiles and sort the pairs by tile, then depth, then row of the input."""
-        pairs = self._engine.pairs_of(self._ellipses, self._grid, region)
-        return TileList(**pairs._asdict(), order=self._ellipses.order, region=region)
+        return self._engine.pairs_of(self._ellipses, self._grid, region)
 
 
 def _spread(first: Tensor, lengths: Tensor, amounts: Tensor | int, bins: int) -> list[int]:

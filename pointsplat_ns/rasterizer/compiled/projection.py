@@ -32,16 +32,6 @@ def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor
     return KERNELS.structs["Scene"](means=means, quats=quats, scales=scales, opacities=opacities, count=len(means))
 
 
-def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
-    """As :func:`~pointsplat_ns.rasterizer.projection.count_meaningless`."""
-    library = KERNELS.library
-    tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
-    ranges = -(-len(means) // library.pointsplat_range())
-    counts = torch.empty(ranges, **INDICES)
-    on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, scene_struct(*tensors), counts)
-    return int(counts.sum())
-
-
 class CompiledProject(torch.autograd.Function):
     """As :class:`~pointsplat_ns.rasterizer.ewa.Project`."""
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.constants import SLACK
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region, TileList
 from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import INDICES
 
@@ -42,7 +42,7 @@ def ellipses_of(
     return found
 
 
-def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
+def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
     library, count = KERNELS.library, len(ellipses.order)
     heights = ellipses.row1.clamp_max(region.bottom - 1).sub_(ellipses.row0.clamp_min(region.top)).add_(1).clamp_min_(0)
@@ -61,4 +61,4 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
     task.fill(offsets=offsets, gaussians=gaussians, places=places)
     library.pointsplat_list(task)
-    return Pairs(gaussians, offsets, places, counts)
+    return TileList(gaussians, offsets, places, counts, ellipses.order, region)
