@@ -166,7 +166,7 @@ def at_a_bound(scene, options):
 
 @needs_compiler
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float64(name):
+def test_projections_and_gradients_are_those_of_torch(name):
     scene, options = made(name)
     ours, torchs, exact = (projected(scene, options, *how) for how in ((F32, True), (F32, False), (F64, False)))
     ids, torchs_ids = (set(seen.ids.tolist()) for _, seen in (ours, torchs))

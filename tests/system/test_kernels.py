@@ -140,7 +140,7 @@ def test_threads_share_the_places_that_they_allocate_from():
 
 
 @pytest.mark.parametrize("variable", [None, "7"])
-def test_a_fixed_number_of_threads_is_that_of_torch_and_of_programs_that_are_started(monkeypatch, variable):
+def test_a_fixed_number_of_threads_holds_for_torch_and_started_programs(monkeypatch, variable):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if variable is not None:
         monkeypatch.setenv("OMP_NUM_THREADS", variable)
