@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 
 if TYPE_CHECKING:
     from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig

@@ -17,7 +17,7 @@ from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, nee
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def _open(path: Path | str, split: Split, data: Path | str | None, cached: bool 
 
 
 def _need_as_rendered(scene: TrainedScene) -> None:
-    from pointsplat_ns.nerfstudio_plugin.corrected_poses import need_photos_as_rendered
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import need_photos_as_rendered
 
     need_photos_as_rendered(scene.run, "leave the photos out")
 

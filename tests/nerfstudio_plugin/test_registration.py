@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.registration import load_specification
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import NERFSTUDIO, quiet_nerfstudio
+from pointsplat_ns.nerfstudio_plugin.registration import NERFSTUDIO, load_specification, quiet_nerfstudio
 from pointsplat_ns.system import threads
 
 FORKED = """
@@ -128,7 +127,7 @@ def test_steps_use_the_threads_chosen_or_set(
         seen.add(torch.get_num_threads())
         return torch.zeros(()), {}, {}
 
-    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
+    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.trainer.StoppableTrainer.one_step", one_step)
     monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
     config = wall_config(wall_scene, tmp_path, 3)
     config.threads = count

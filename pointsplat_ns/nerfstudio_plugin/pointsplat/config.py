@@ -18,7 +18,7 @@ from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
+from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 from pointsplat_ns.system.processes import by_first, connect_torchrun, gathered, local_rank, rank, torchrun_rank
 
 REFINER_RATES = {

@@ -22,8 +22,8 @@ from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, to_device
-from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
+from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
 

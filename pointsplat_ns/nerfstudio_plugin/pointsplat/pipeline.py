@@ -5,20 +5,22 @@ from __future__ import annotations
 import dataclasses
 import random
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.distributed as dist
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
-from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     SceneReport,
@@ -27,8 +29,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     print_summary,
     summarize_by_reference,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES, PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
@@ -140,20 +141,17 @@ class PointSplatPipeline(VanillaPipeline):
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
         been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
-        over processes; the gradients are each process's own. The metric ``faults`` is a list of texts, one for each
-        loss of this process that is not finite.
+        over processes; the gradients are each process's own, and so are the ``own_losses`` among the metrics.
         """
         for later in range(step, step + 1 + LOOK_AHEAD):
             self._start(later)
         torch.manual_seed(self._seed(step))
         index, frames = self.datamanager.next_train(step)
-        outputs, losses, metrics = self.model.losses(index, frames)
-        faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
-        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
-        if self.world_size > 1:
-            losses = {name: distributed.with_value(value, means[name]) for name, value in losses.items()}
-        metrics |= {"psnr": means["psnr"], "scene": index, "faults": faults}
-        return outputs, losses, metrics
+        outputs, own, metrics = self.model.losses(index, frames)
+        means = means_over_ranks({**own, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
+        # the values of the means, with the gradients of this process's own
+        losses = own if self.world_size == 1 else {n: v + (means[n] - v).detach() for n, v in own.items()}
+        return outputs, losses, metrics | {"psnr": means["psnr"], "scene": index, "own_losses": own}
 
     def _seed(self, step: int) -> int:
         """Seed of the random numbers of a step."""
@@ -265,3 +263,19 @@ class PointSplatPipeline(VanillaPipeline):
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]
+
+
+def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    """Mean of each named scalar over the processes that have it, without gradient, for the names that this process has.
+    ``names`` are the same in every process; ``values`` are this process's, on its device."""
+    present = [name for name in names if name in values]
+    if processes.world_size() == 1:
+        return {name: values[name].detach() for name in present}
+    device = next(iter(values.values())).device
+    table = torch.zeros(2, len(names), dtype=torch.float64, device=device)  # sums and counts
+    for column, name in enumerate(names):
+        if name in values:
+            table[0, column], table[1, column] = values[name].detach().double(), 1.0
+    dist.all_reduce(table)
+    means = dict(zip(names, table[0] / table[1], strict=True))
+    return {name: means[name].to(values[name].dtype) for name in present}

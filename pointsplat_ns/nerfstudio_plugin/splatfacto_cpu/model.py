@@ -29,11 +29,9 @@ from torchmetrics.image import PeakSignalNoiseRatio
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
-from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, RasterizerOptions, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import CappedStrategy
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
     at_most,
@@ -43,7 +41,6 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
     random_seeds_near_cameras,
 )
 from pointsplat_ns.rasterizer.rendering import Colors
-from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
@@ -122,10 +119,6 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
             revised_opacity=False,
             verbose=True,
         )
-
-    def kernels(self) -> dict[str, Kernels]:
-        """Compiled kernels of the rasterizer and of the loss."""
-        return {**super().kernels(), "SSIM": structural_similarity.KERNELS}
 
 
 class SplatfactoCpuModel(SplatfactoModel):

@@ -44,7 +44,7 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
         modes.append((arguments["rasterize_mode"], arguments["sh_degree"]))
         return rasterization(**arguments)
 
-    place = "pointsplat_ns.nerfstudio_plugin.rasterizer_options.rasterization"
+    place = "pointsplat_ns.nerfstudio_plugin.cameras.rasterization"
     with mock.patch(place, recorded), torch.no_grad():
         for index in (0, 1):
             pipeline.model.losses(index, [next(pipeline.datamanager.held_out(index))])
