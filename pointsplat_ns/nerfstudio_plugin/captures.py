@@ -61,7 +61,7 @@ def dataparser_for(capture: Path) -> DataParserConfig:
     from pointsplat_ns.nerfstudio_plugin.replica.layout import NICE_SLAM, SEMANTIC_NERF
     from pointsplat_ns.nerfstudio_plugin.scannetpp import SOURCES, SeededScanNetppDataParserConfig
 
-    if (capture / "dslr").is_dir() or any((capture / source.transforms).is_file() for source in SOURCES):
+    if (capture / "dslr").is_dir() or any((capture / source["transforms_path"]).is_file() for source in SOURCES):
         return SeededScanNetppDataParserConfig()
     if any((capture / names.trajectory).is_file() for names in (NICE_SLAM, SEMANTIC_NERF)):
         return ReplicaDataParserConfig()

@@ -59,7 +59,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     that is broken fails each time its turn comes, and the steps on other scenes in between would reset the count."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
-    gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
+    steps_per_eval_batch: Suppress[Fixed[int]] = 0
     prompt: Suppress[Fixed[str | None]] = None
 
     def set_timestamp(self) -> None:
@@ -122,7 +122,6 @@ def pointsplat_config() -> TrainerConfig:
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=2000,
         steps_per_save=500,
-        steps_per_eval_batch=0,
         steps_per_eval_image=100,
         steps_per_eval_all_images=0,
         mixed_precision=False,

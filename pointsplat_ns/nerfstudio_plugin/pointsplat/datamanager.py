@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -21,7 +20,7 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, to_device
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
@@ -152,12 +151,11 @@ class ScenesDataManager(SpiralSource):
         return self.training_frames(self.shown).dataset._dataparser_outputs
 
     def setup_train(self) -> None:
-        """Nothing to set up: photos are read when they are needed."""
+        """Nothing: photos are read when they are needed."""
 
-    def setup_eval(self) -> None:
-        """Nothing to set up: photos are read when they are needed."""
+    setup_eval = setup_train
 
-    def training_frames(self, scene: int) -> Any:
+    def training_frames(self, scene: int) -> Frames:
         """The training targets of a scene: its photos, or the dense scene's own renders."""
         scene_at = self.scenes[scene]
         return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
@@ -190,7 +188,7 @@ class ScenesDataManager(SpiralSource):
         self.training_frames(scene).prefetch(photos)
         return scene, photos
 
-    def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+    def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on this process's device."""
         scene, photos = self.background.take(step, functools.partial(self._choice, step))
         targets = self.training_frames(scene)
@@ -198,7 +196,7 @@ class ScenesDataManager(SpiralSource):
         self._pixels = sum(int(camera.height) * int(camera.width) for camera, _ in frames)
         return scene, frames
 
-    def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+    def next_eval_image(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of an evaluation scene, and one of its held-out photos."""
         scene = self.eval_indices[step % len(self.eval_indices)]
         frames = self.scenes[scene].eval_frames
@@ -209,21 +207,13 @@ class ScenesDataManager(SpiralSource):
         index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
         return scene, [to_device(frames[index], self.device)]
 
-    def next_eval_image(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
-        """As :meth:`next_eval`."""
-        return self.next_eval(step)
-
-    def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+    def held_out(self, scene: int) -> Iterator[Frame]:
         """Every held-out photo of a scene with its camera, on this process's device."""
         return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the latest step, for nerfstudio's log."""
         return self._pixels
-
-    def get_eval_rays_per_batch(self) -> int:
-        """Pixels of a held-out photo, for nerfstudio's log."""
-        return self.get_train_rays_per_batch() // self.config.images_per_step
 
     def get_datapath(self) -> Path:
         """The path given by ``--data``."""

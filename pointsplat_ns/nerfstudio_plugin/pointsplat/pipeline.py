@@ -27,7 +27,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     evaluate_scene,
     only_finite,
     print_summary,
-    summarize_by_reference,
+    summarize,
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES, PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
@@ -164,16 +164,6 @@ class PointSplatPipeline(VanillaPipeline):
         self.model.start(self.datamanager.scene_at(step), torch.Generator("cpu").manual_seed(self._seed(step)))
 
     @torch.no_grad()
-    def get_eval_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
-        """Losses at one held-out photo."""
-        training = self.training
-        self.eval()
-        index, frames = self.datamanager.next_eval(step)
-        result = self.model.losses(index, frames)
-        self.train(training)
-        return result
-
-    @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
         """Metrics at one held-out photo, and an image of photo, pruned and refined side by side."""
         training = self.training
@@ -227,7 +217,7 @@ class PointSplatPipeline(VanillaPipeline):
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
         reports = sorted(processes.gathered(reports), key=lambda report: order[report.name])
-        summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
+        summary = summarize(reports, get_std)
         config = self.config.model
         summary["settings"] = {
             "size": config.size,
