@@ -199,7 +199,7 @@ def rename_photos(scene: Path) -> None:
     [
         (spoil_pose, "poses of 10 photos are not those of transforms.json.*--load-seed-points False"),
         (rename_photos, "knows none of the 10 photos by name"),
-        (mark_all, "train split: all 7 frames are marked is_bad.*--skip-bad False"),
+        (mark_all, "train split: all 7 frames are hidden or marked is_bad.*--skip-bad False"),
         (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
         (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
         (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),

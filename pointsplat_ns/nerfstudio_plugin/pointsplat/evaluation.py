@@ -93,9 +93,9 @@ def evaluate_scene(
     for camera, data in tracked(frames, f"evaluating {scene.name}", count, progress):
         pictures: list[Tensor] = []
         for name, gaussians in variants.items():
-            start = _now(model.device)
+            start = now(model.device)
             outputs = model.draw(gaussians, scene, camera)
-            seconds[name].append(_now(model.device) - start)
+            seconds[name].append(now(model.device) - start)
             photo, rgb = model.photo_of(data, outputs["background"]), outputs["rgb"]
             pictures = [*(pictures or [photo]), rgb]
             for metric, measure in (("psnr", psnr), ("ssim", ssim), ("lpips", lpips)):
@@ -208,7 +208,8 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _now(device: torch.device) -> float:
+def now(device: torch.device) -> float:
+    """Seconds since any moment, once the device has done its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

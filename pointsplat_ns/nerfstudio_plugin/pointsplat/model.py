@@ -7,10 +7,9 @@ viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network i
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -29,12 +28,14 @@ from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.metrics import ImageError, psnr
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background, PrunedScene, PrunedScenes
+from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import PrunedScene, PrunedScenes
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.augmentation import random_transform
+
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
 
 PIXEL_LOSSES: dict[str, Callable[[Tensor], Tensor]] = {
     "l1": lambda difference: difference.abs().mean(),
@@ -116,7 +117,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
 
 
 class PointSplatModel(SplatfactoModel):
-    """The model described in the module's docstring. The pipeline passes in the scenes by :meth:`attach`."""
+    """The model described in the module's docstring. The scenes are those of the ``datamanager`` that it is given."""
 
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
@@ -126,18 +127,12 @@ class PointSplatModel(SplatfactoModel):
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
         self.crop_box: OrientedBox | None = None
-        self.scenes: list[DenseScene] = []
-        self.shown = 0
-        """Index of the scene that the viewer and the exporter get."""
+        manager: ScenesDataManager = self.kwargs["datamanager"]
+        self.scenes, self.shown = manager.scenes, manager.shown
+        self._pruned = PrunedScenes(manager.cache, self.refiner.prepare, manager.background)
         self.no_lpips_reason: str | None = None
         """Why LPIPS is left out of the loss; None while it is part of it."""
         self._refined: tuple[int, Gaussians] | None = None
-
-    def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache, background: Background) -> None:
-        """Set the scenes, the index of the one that the viewer and the exporter get, the cache for pruned scenes, and
-        what prunes them ahead."""
-        self.scenes, self.shown = scenes, shown
-        self._pruned = PrunedScenes(cache, self.refiner.prepare, background)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the
@@ -185,21 +180,10 @@ class PointSplatModel(SplatfactoModel):
                 self._refined = index, self.refiner(scene.pruned, scene.structure)
         return self._refined[1]
 
-    def _drawn_keep(self, generator: torch.Generator | None = None) -> float | None:
-        """The budget of a training step, its first random number if there are several; None is the config's
-        ``keep``."""
+    def _drawn_keep(self, generator: torch.Generator | None = None) -> float:
+        """The budget of a training step, its first random number if there are several."""
         keeps = (self.config.keep, *self.config.more_keeps)
-        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu"))] if len(keeps) > 1 else None
-
-    def timed_refine(self, index: int) -> tuple[Gaussians, float]:
-        """As :meth:`refine` in evaluation, but not from the cache, and the seconds that it took."""
-        self.pruned_scene(index)
-        self._refined = None
-        start = time.perf_counter()
-        refined = self.refine(index)
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return refined, time.perf_counter() - start
+        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu")) if len(keeps) > 1 else 0]
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
         """Render Gaussians with a scene's background and rasterize mode, from a camera of shape (1,), all on the

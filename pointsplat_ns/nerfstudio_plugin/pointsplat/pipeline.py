@@ -25,6 +25,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataMan
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     SceneReport,
     evaluate_scene,
+    now,
     only_finite,
     print_summary,
     summarize,
@@ -101,10 +102,10 @@ class PointSplatPipeline(VanillaPipeline):
             device=device, test_mode=test_mode, world_size=world_size, local_rank=processes.rank()
         )
         torch.manual_seed(config.datamanager.seed)
-        self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
+        self._model = config.model.setup(
+            scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler, datamanager=self.datamanager
+        )
         self.model.to(device)
-        manager = self.datamanager
-        self.model.attach(manager.scenes, manager.shown, manager.cache, manager.background)
         processes.share_state(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
         trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
@@ -206,7 +207,9 @@ class PointSplatPipeline(VanillaPipeline):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
             smaller = model.pruned_scene(index, dense)
-            refined, seconds = model.timed_refine(index)
+            start = now(model.device)
+            refined = model.refiner(smaller.pruned, smaller.structure)
+            seconds = now(model.device) - start
             variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
             frames, count = manager.held_out(index), len(scene.eval_frames)
             report = evaluate_scene(model, scene, variants, frames, count, lpips, output_path, progress=True)
@@ -219,11 +222,8 @@ class PointSplatPipeline(VanillaPipeline):
         reports = sorted(processes.gathered(reports), key=lambda report: order[report.name])
         summary = summarize(reports, get_std)
         config = self.config.model
-        summary["settings"] = {
-            "size": config.size,
-            **config.network_options(),
-            **dataclasses.asdict(config.prune_settings()),
-        }
+        pruning = dataclasses.asdict(config.prune_settings())
+        summary["settings"] = {"size": config.size, **config.network_options(), **pruning}
         summary["supervision"] = manager.supervision
         if lpips.reason is not None:
             summary["lpips_note"] = lpips.reason

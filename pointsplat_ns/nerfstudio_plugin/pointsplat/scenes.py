@@ -257,11 +257,10 @@ def training_scenes(
                 missing.append(f"{run.config_path}: its data {run.data} is not there")
                 what = "left out" if chosen == "photos" else "seen from sampled poses"
                 CONSOLE.log(f"{name} is {what}: {missing[-1]}")
-            if chosen == "photos":
-                if not has_photos:
-                    continue
+            if has_photos and chosen == "photos":
                 need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
-        scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
+        if has_photos or chosen == "dense":
+            scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
     scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
     if not scenes:
         others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""

@@ -23,8 +23,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.metrics.lpips import LpipsUnavailable
-from pointsplat_ns.nerfstudio_plugin.pointsplat.distributed import means_over_ranks
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
+from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline, means_over_ranks
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.system.processes import average_gradients, gathered
 from quick_looking import QUICK
@@ -104,7 +103,8 @@ def two_scenes_a_step() -> Iterator[None]:
         _, losses, metrics = zip(*parts, strict=True)
         means = {name: (losses[0][name] + losses[1][name]) / 2 for name in losses[0]}
         metrics[0]["psnr"] = (metrics[0]["psnr"] + metrics[1]["psnr"]) / 2
-        metrics[0]["faults"] += metrics[1]["faults"]
+        for name, value in metrics[1]["own_losses"].items():
+            metrics[0]["own_losses"][name] = metrics[0]["own_losses"][name] + value
         return {}, means, metrics[0]
 
     with mock.patch.object(PointSplatPipeline, "get_train_loss_dict", both):

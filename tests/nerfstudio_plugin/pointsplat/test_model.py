@@ -77,7 +77,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     sum(losses.values()).backward()
     assert all(p.grad.isfinite().all() for p in pipeline.model.refiner.parameters() if p.grad is not None)
     if not some_lpips:
-        assert set(losses) == {"l1"} and "no network" in pipeline.model.loss.no_lpips_reason
+        assert set(losses) == {"l1"} and "no network" in pipeline.model.no_lpips_reason
         return
     with torch.no_grad():
         outputs = pipeline.model.draw(pipeline.model.pruned_scene(0).pruned, pipeline.datamanager.scenes[0], frame[0])

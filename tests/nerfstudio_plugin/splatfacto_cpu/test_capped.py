@@ -6,12 +6,10 @@ from fractions import Fraction
 import pytest
 import torch
 
-from making import equal
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import (
     CappedStrategy,
-    next_count,
     position_noise,
     shared_opacity,
 )
@@ -70,16 +68,6 @@ def test_noise_follows_the_covariance_and_falls_with_opacity():
     assert single.dtype == torch.float32 and single.isfinite().all()
 
 
-def test_the_number_grows_as_fast_as_needed_and_is_reached_exactly():
-    assert next_count(1000, 5000, 100) == 1050
-    assert next_count(990, 1000, 100) == next_count(1000, 1000, 3) == next_count(10, 1000, 0) == 1000
-    number = 10
-    for later in range(7, -1, -1):
-        before, number = number, next_count(number, 1000, later)
-        assert 1.5 < number / before < 2.2, "the same factor each time, up to whole numbers"
-    assert number == 1000
-
-
 def test_the_picture_hardly_changes_where_gaussians_move_to_others():
     """A transparent Gaussian is moved, one is added; both to the only opaque ones."""
     params = torch.nn.ParameterDict(
@@ -128,18 +116,6 @@ def test_a_training_ends_with_exactly_so_many_gaussians(capped_config, run_train
         if name in model.gauss_params:
             assert optimizer.param_groups[0]["params"][0] is model.gauss_params[name]
             assert optimizer.state[model.gauss_params[name]]["exp_avg"].shape == model.gauss_params[name].shape
-
-
-def test_a_capped_training_that_was_cut_off_goes_on_as_if_it_had_not_been(capped_config, run_training, tmp_path):
-    config = capped_config(tmp_path, 32, 400)
-    config.steps_per_save, config.save_only_latest_checkpoint = 12, False
-    whole, losses = run_training(config)
-    rest = capped_config(tmp_path / "rest", 32 - 13, 400)
-    rest.load_dir, rest.load_step = config.get_checkpoint_dir(), 12
-    resumed, last_losses = run_training(rest)
-    assert whole.pipeline.model.num_points == 400
-    assert last_losses == losses[13:], "to the bit, over step 20, which densifies"
-    assert equal(dict(resumed.pipeline.model.gauss_params), dict(whole.pipeline.model.gauss_params))
 
 
 def test_a_capped_training_is_the_same_on_two_threads(capped_config, run_training, tmp_path):

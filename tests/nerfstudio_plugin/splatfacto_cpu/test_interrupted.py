@@ -119,7 +119,7 @@ def test_a_training_stopped_in_its_last_step_closes_its_viewer(asked, waits, mon
     assert (waited == [trainer]) == waits
 
 
-LOG = "pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer.CONSOLE.log"
+LOG = "pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log"
 
 
 @contextmanager
@@ -182,7 +182,7 @@ def take(trainer, steps) -> list[dict]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"), [("nan", "the main_loss is nan"), ("gradient", "the gradient of the scales is not finite")]
+    ("kind", "said"), [("nan", "the loss main_loss is nan"), ("gradient", "the gradient of the scales is not finite")]
 )
 def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, said):
     take(started, range(2))
@@ -193,9 +193,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, s
     assert equal(state_of(started), before)
     photo = started.pipeline.datamanager.latest_photo
     assert started.skipped == {photo: 1} and metrics["skipped_steps"] == 1 and photo.endswith((".png", ".jpg"))
-    assert [call.args[0] for call in log.call_args_list] == [
-        f"step 2 is skipped: {photo}: {said} (said once for each photo)"
-    ]
+    assert [call.args[0] for call in log.call_args_list] == [f"step 2 is skipped: {photo}: {said} (said once for each)"]
     (metrics,) = take(started, [3])  # a sound one
     assert metrics["skipped_steps"] == 1 and not equal(state_of(started)["parameters"], before["parameters"])
 
