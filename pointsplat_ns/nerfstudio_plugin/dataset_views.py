@@ -120,7 +120,7 @@ class TrainingPhotos(Sequence[Example]):
         from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
 
         camera, data = self._frames[index]
-        view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
+        view = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
         return Example(view, data["image"][..., :3], data.get("mask"))
 
 

@@ -70,9 +70,9 @@ class Frames:
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
-    masks, and ``image_idx``. The tensors are shared with the cache, which by default takes a quarter of the free
-    memory: do not write to them. ``max_workers`` threads decode ahead, if any. A photo or mask that cannot be used is a
-    DataError.
+    masks, and ``image_idx``, all on ``device``. The tensors are shared with the cache, which by default takes a quarter
+    of the free memory: do not write to them. ``max_workers`` threads decode ahead, if any. A photo or mask that cannot
+    be used is a DataError.
     """
 
     look_ahead = 4
@@ -85,8 +85,9 @@ class Frames:
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
         max_workers: int = 2,
+        device: torch.device | str = "cpu",
     ):
-        self.dataset = dataset
+        self.dataset, self.device = dataset, device
         self.image_type: Literal["uint8", "float32"] = image_type
         self.cache = MemoryCache.of() if cache is None else cache
         self._owner = object()
@@ -103,7 +104,8 @@ class Frames:
             loading = self._loading.get(index)
         frame = loading.result() if loading is not None else self.cache.get(("photo", self._owner, index))
         camera, data = self._load(index) if frame is None else frame
-        return copy.deepcopy(camera), data.copy()
+        moved = {name: data[name].to(self.device) for name in ("image", "mask") if name in data}
+        return copy.deepcopy(camera).to(self.device), {**data, **moved}
 
     def __iter__(self) -> Iterator[Frame]:
         for index in range(len(self)):
@@ -130,12 +132,3 @@ class Frames:
         frame = self.dataset.cameras[index : index + 1], data
         self.cache.put(("photo", self._owner, index), frame)
         return frame
-
-
-def to_device(frame: Frame, device: torch.device | str) -> Frame:
-    """A camera and its photo on a device."""
-    camera, data = frame
-    for name in ("image", "mask"):
-        if name in data:
-            data[name] = data[name].to(device)
-    return camera.to(device), data

@@ -189,15 +189,15 @@ def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, wo
 
 def test_pictures_of_another_kind_or_size_and_broken_ones_are_refused(scene):
     loaded = load_replica(scene)
-    Image.new("RGB", (9, 6)).save(loaded.photos[1])
-    with pytest.raises(DataError, match="frame000001.png: 9 x 6 pixels; expected 8 x 6"):
-        read_photo(loaded.photos[1], loaded.params)
-    loaded.photos[1].write_bytes(b"")
-    with pytest.raises(DataError, match="not a readable picture"):
-        read_photo(loaded.photos[1], loaded.params)
-    loaded.photos[1].unlink()
-    with pytest.raises(DataError, match="frame000001.png: .*FileNotFoundError"):
-        read_photo(loaded.photos[1], loaded.params)
+    photo = loaded.photos[1]
+    for spoil, message in (
+        (lambda: Image.new("RGB", (9, 6)).save(photo), "frame000001.png: 9 x 6 pixels; expected 8 x 6"),
+        (lambda: photo.write_bytes(b""), "not a readable picture"),
+        (photo.unlink, "frame000001.png: .*FileNotFoundError"),
+    ):
+        spoil()
+        with pytest.raises(DataError, match=message):
+            read_photo(photo, loaded.params)
     depth = loaded.depths[1]
     Image.new("L", (8, 6)).save(depth)
     with pytest.raises(DataError, match="expected a 16-bit grey"):

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
@@ -19,6 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table
@@ -68,8 +68,7 @@ def evaluate_scene(
     model: PointSplatModel,
     scene: DenseScene,
     variants: dict[str, Gaussians],
-    frames: Iterable[tuple[Cameras, dict]],
-    count: int,
+    frames: Frames | list[Frame],
     lpips: ReportedLpips,
     picture_folder: Path | None = None,
     progress: bool = False,
@@ -80,7 +79,7 @@ def evaluate_scene(
         model: renders the variants; must be in evaluation mode.
         scene: gives the background and the rasterize mode.
         variants: the scene's variants by name, on the model's device.
-        frames, count: cameras of shape (1,) and their photos, and their number, for the progress bar.
+        frames: cameras of shape (1,) and their photos.
         lpips: computes LPIPS. If it fails for one view, the scene has no LPIPS.
         picture_folder: folder for an image of every view; None writes none.
 
@@ -90,7 +89,7 @@ def evaluate_scene(
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
     picture, views = None, 0
-    for camera, data in tracked(frames, f"evaluating {scene.name}", count, progress):
+    for camera, data in tracked(frames, f"evaluating {scene.name}", len(frames), progress):
         pictures: list[Tensor] = []
         for name, gaussians in variants.items():
             start = now(model.device)

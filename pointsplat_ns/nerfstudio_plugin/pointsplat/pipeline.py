@@ -172,7 +172,7 @@ class PointSplatPipeline(VanillaPipeline):
         index, frames = self.datamanager.next_eval_image(step)
         variants = {"pruned": self.model.pruned_scene(index).pruned, "refined": self.model.refine(index)}
         scene = self.datamanager.scenes[index]
-        report = evaluate_scene(self.model, scene, variants, frames, 1, ReportedLpips())
+        report = evaluate_scene(self.model, scene, variants, frames, ReportedLpips())
         pixels = int(frames[0][0].height) * int(frames[0][0].width)
         metrics: dict[str, Any] = {"num_rays": pixels}
         for variant, values in report.variants.items():
@@ -211,8 +211,7 @@ class PointSplatPipeline(VanillaPipeline):
             refined = model.refiner(smaller.pruned, smaller.structure)
             seconds = now(model.device) - start
             variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
-            frames, count = manager.held_out(index), len(scene.eval_frames)
-            report = evaluate_scene(model, scene, variants, frames, count, lpips, output_path, progress=True)
+            report = evaluate_scene(model, scene, variants, scene.eval_frames, lpips, output_path, progress=True)
             report.seen_in_training = scene.identity in self.training_state.trained_on
             report.seconds = {"prune": smaller.seconds, "refine": seconds}
             report.last_picture = None

@@ -192,7 +192,7 @@ class TrainedScene(DenseScene):
         dataset = UndistortedDataset(self._outputs(split), scale)
         if split == "train":
             dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
-        return Frames(dataset, cache=self.cache)
+        return Frames(dataset, cache=self.cache, device=self._device)
 
     @cached_property
     def train_frames(self) -> Any:

@@ -240,7 +240,10 @@ class SplatfactoCpuModel(SplatfactoModel):
             width, height = int(camera.width.item()), int(camera.height.item())
             return self.get_empty_outputs(width, height, self.background_color.to(self.device))
         camera_to_worlds = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
-        intrinsics, width, height = self._drawn_size(camera)
+        factor = self._get_downscale_factor()
+        width, height = int(camera.width.item()) // factor, int(camera.height.item()) // factor
+        intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
+        intrinsics[:, :2] /= factor
         with_depth = self.config.output_depth_during_training or not self.training
         image, alpha, info = self._draw(params, camera_to_worlds, intrinsics, width, height, with_depth)
         self.last_size = (height, width)
@@ -272,13 +275,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             return params
         inside = self.crop_box.within(self.means).reshape(-1)
         return {name: value[inside] for name, value in params.items()} if inside.any() else None
-
-    def _drawn_size(self, camera: Cameras) -> tuple[Tensor, int, int]:
-        """Intrinsics (1, 3, 3), width and height, in pixels at the resolution of this step."""
-        factor = self._get_downscale_factor()
-        intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
-        intrinsics[:, :2] /= factor
-        return intrinsics, int(camera.width.item()) // factor, int(camera.height.item()) // factor
 
     def _draw(
         self,

@@ -15,7 +15,6 @@ import torch
 from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
 from pointsplat_ns.nerfstudio_plugin.trainer import STATE, StoppableTrainer
@@ -38,11 +37,6 @@ class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
     """nerfstudio's pipeline, with an evaluation that is always valid JSON"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
-
-    def setup(self, **kwargs) -> Any:
-        """Build the pipeline, and let torch read nerfstudio's checkpoints, which happens right after this."""
-        allow_splatfacto_checkpoints()
-        return super().setup(**kwargs)
 
 
 class SplatfactoCpuPipeline(VanillaPipeline):

@@ -8,27 +8,13 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
-from making import dense_config, equal, pipeline_of
+from making import dense_config, equal
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
-
-
-def view_loss(model, manager, index: int) -> float:
-    with torch.no_grad():
-        _, losses, _ = model.losses(index, [f for f in manager.scenes[index].train_frames])
-    return float(losses["l1"])
-
-
-def test_training_lowers_the_loss_on_all_views(trained, trained_walls):
-    _, trainer, _ = trained
-    untrained = pipeline_of(trained_walls)
-    model = trainer.pipeline.eval().model
-    before = view_loss(untrained.model, untrained.datamanager, 0)
-    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.95 * before
 
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
@@ -103,8 +89,8 @@ def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(three_
     config = dense_config(three_rooms, tmp_path, 50)
     config.max_skipped_steps = 3
     message = (
-        r"training stopped at step 3: losses or gradients were not finite in 4 steps \(more than --max-skipped-steps 3\), "
-        r"which were skipped \(room\d: 2, room\d: 1, room\d: 1\); .*lower the learning rates; .*--load-dir "
+        r"training stopped at step 3: losses or gradients were not finite in 4 steps \(more than --max-skipped-steps "
+        r"3\), which were skipped \(room\d: 2, room\d: 1, room\d: 1\); .*lower the learning rates; .*--load-dir "
     )
     with broken("nan", set(range(50))), pytest.raises(DataError, match=message) as caught:
         run_training(config)

@@ -145,21 +145,6 @@ def test_random_points_of_a_cap_are_uniform_in_contracted_space():
     assert float(near.norm(dim=1).max()) <= 1 + 1e-5
 
 
-def test_max_gs_num_sets_the_cap_and_the_length_its_schedule():
-    config = splatfacto_cpu_config()
-    assert config.pipeline.model.cap is None
-    assert SplatfactoCpuModelConfig(strategy="mcmc").cap == 1_000_000
-    config.pipeline.model.max_gs_num = 50_000
-    assert config.pipeline.model.cap == 50_000
-    config.max_num_iterations = 3000
-    strategy = fitted_schedules(config).pipeline.model.densification(10)
-    assert isinstance(strategy, CappedStrategy) and strategy.every == 43
-    assert strategy.first_step < strategy.full_from < strategy.last_step < 3000
-    config.pipeline.model.max_gs_num = 0
-    with pytest.raises(PointSplatError, match="max-gs-num 0: expected at least 1"):
-        _ = config.pipeline.model.cap
-
-
 def test_a_short_training_densifies_by_gradient_alone():
     """Rates begin (30,000 / steps) ** 0.5 times higher, and the gradient of densification rises by the root of that."""
     config = splatfacto_cpu_config()
@@ -168,8 +153,15 @@ def test_a_short_training_densifies_by_gradient_alone():
     assert short.densification(10).refine_scale2d_stop_iter == 0
     assert short.densify_grad_thresh == pytest.approx(2 * SplatfactoCpuModelConfig().densify_grad_thresh)
     assert fitted_schedules(config).optimizers["means"]["scheduler"].first == pytest.approx(4)
+    config.pipeline.model.max_gs_num = 50_000
+    strategy = fitted_schedules(config).pipeline.model.densification(10)
+    assert isinstance(strategy, CappedStrategy) and strategy.most == 50_000
+    assert strategy.first_step < strategy.full_from < strategy.last_step < 1875
     config.pipeline.model.stop_screen_size_at = 7
     assert fitted_schedules(config).pipeline.model.stop_screen_size_at == 7
     whole = splatfacto_cpu_config()
     whole.max_num_iterations = 30_000
     assert fitted_schedules(whole).pipeline.model == SplatfactoCpuModelConfig()
+    whole.pipeline.model.max_gs_num = 0
+    with pytest.raises(PointSplatError, match="max-gs-num 0: expected at least 1"):
+        _ = whole.pipeline.model.cap

@@ -109,16 +109,6 @@ def test_a_second_or_early_signal_ends_it_at_once_and_saves_nothing(
     assert end.value.code == 130 and not early.get_checkpoint_dir().exists()
 
 
-@pytest.mark.parametrize("asked, waits", [(None, True), (signal.SIGINT, False)])
-def test_a_training_stopped_in_its_last_step_closes_its_viewer(asked, waits, monkeypatch):
-    waited = []
-    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda trainer: waited.append(trainer))
-    trainer = object.__new__(SplatfactoCpuTrainer)
-    trainer._asked = asked
-    trainer._train_complete_viewer()
-    assert (waited == [trainer]) == waits
-
-
 LOG = "pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log"
 
 
