@@ -36,6 +36,10 @@ from pointsplat_ns.system.threads import fixed_threads, suitable_threads
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
+MOST_SKIPPED_IN_A_ROW = 10
+"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
+and names their photos or scenes. One that is broken among sound ones stops nothing."""
+
 
 @dataclass
 class StoppableTrainerConfig(TrainerConfig):
@@ -111,6 +115,7 @@ class StoppableTrainer(Trainer):
         super().__init__(config, local_rank, world_size)
         self.skipped: Counter[str] = Counter()
         """Number of steps that were skipped, by photo or scene, over all processes."""
+        self._skipped_in_a_row = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's. If the data or a number of steps cannot be used, the run folder, which then holds only the
@@ -183,8 +188,8 @@ class StoppableTrainer(Trainer):
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """The loss, its parts, and numbers for the log, as nerfstudio's ``train_iteration``, which cannot skip a step.
 
-        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow. After too many
-        skipped steps, a checkpoint is saved, and a DataError that names their photos or scenes ends the training.
+        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow. If more than
+        :data:`MOST_SKIPPED_IN_A_ROW` steps were skipped, a checkpoint is saved, and a DataError ends the training.
         """
         pipeline, every = self.pipeline, self.gradient_accumulation_steps
         buffers = [(buffer, buffer.clone()) for buffer in pipeline.model.buffers()]
@@ -215,13 +220,14 @@ class StoppableTrainer(Trainer):
             norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
             metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
             metrics["Gradients/Total"] = sum(norms.values(), torch.zeros(()))
-        if skip and (too_many := self.too_many_skipped()):
+        self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
+        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
             self.save_checkpoint(step)
             sources = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
             raise DataError(
-                f"training stopped at step {step}: losses or gradients were not finite in {too_many}, which were "
-                f"skipped ({sources}); repair or leave out what is named, or lower the learning rates; then go on with "
-                f"--load-dir {self.checkpoint_dir}"
+                f"training stopped at step {step}: losses or gradients were not finite in the last "
+                f"{self._skipped_in_a_row} steps, which were skipped ({sources}); mend or leave out what is named, or "
+                f"lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
             )
         return loss, losses, metrics
 
@@ -242,10 +248,6 @@ class StoppableTrainer(Trainer):
 
     def source_of(self, metrics: dict[str, Any]) -> str:
         """Name of the photo or scene of the latest step."""
-        raise NotImplementedError
-
-    def too_many_skipped(self) -> str:
-        """How many steps were skipped, if these are too many; else an empty text."""
         raise NotImplementedError
 
     def _count(self, step: int, source: str, faults: list[str]) -> None:

@@ -53,10 +53,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
-    max_skipped_steps: int = 10
-    """Total number of steps that may be skipped because a loss or a gradient is not finite (a broken photo or scene,
-    rates too high), before training stops and names the scenes. It is a total, not a number of steps in a row: a scene
-    that is broken fails each time its turn comes, and the steps on other scenes in between would reset the count."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
     steps_per_eval_batch: Suppress[Fixed[int]] = 0

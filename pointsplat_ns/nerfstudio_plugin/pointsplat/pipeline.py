@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,18 +55,6 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
     model: PointSplatModelConfig = field(default_factory=PointSplatModelConfig)
 
 
-@dataclass
-class TrainingState:
-    """The state of a training that checkpoints hold beside weights and optimisers."""
-
-    trained_on: set[str]
-    """Identities of the scenes that the network has been trained on, also before it was resumed."""
-    seconds: float = 0.0
-    """Duration of the training so far, also before it was resumed."""
-    skipped: Counter[str] = field(default_factory=Counter)
-    """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
-
-
 class PointSplatPipeline(VanillaPipeline):
     """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
     ``--data`` holds no scene, ``world_size`` processes are not connected, or several share batch norm."""
@@ -108,24 +95,20 @@ class PointSplatPipeline(VanillaPipeline):
         self.model.to(device)
         processes.share_state(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
-        trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
-        self.training_state = TrainingState(set(trained_on))
-        """State of the training that checkpoints hold beside weights and optimisers."""
+        self.trained_on = {scenes[i].identity for i in indices} if test_mode == "val" else set()
+        """Identities of the scenes that the network has been trained on, also before it was resumed."""
+        self.seconds = 0.0
+        """Duration of the training so far, also before it was resumed."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The training state, for torch's ``state_dict``."""
-        state = self.training_state
-        return {"trained_on": sorted(state.trained_on), "skipped": dict(state.skipped), "seconds": state.seconds}
+        """The state of the training that checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""
+        return {"trained_on": sorted(self.trained_on), "seconds": self.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Load the training state of a checkpoint; logs which of its scenes are missing now. The counts of skipped
-        steps of these are dropped."""
-        scenes, ours = self.datamanager.scenes, self.training_state
-        there = {scene.name for scene in scenes}
-        ours.seconds = state.get("seconds", 0.0)
-        ours.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
-        ours.trained_on |= set(state["trained_on"])
-        gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
+        """Load the state of a checkpoint; logs which of its scenes are missing now."""
+        self.seconds = state.get("seconds", 0.0)
+        self.trained_on |= set(state["trained_on"])
+        gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
         if gone:
             CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
 
@@ -212,7 +195,7 @@ class PointSplatPipeline(VanillaPipeline):
             seconds = now(model.device) - start
             variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
             report = evaluate_scene(model, scene, variants, scene.eval_frames, lpips, output_path, progress=True)
-            report.seen_in_training = scene.identity in self.training_state.trained_on
+            report.seen_in_training = scene.identity in self.trained_on
             report.seconds = {"prune": smaller.seconds, "refine": seconds}
             report.last_picture = None
             reports.append(report)

@@ -51,15 +51,8 @@ class PointSplatTrainer(StoppableTrainer):
         super().__init__(config, local_rank, world_size)
         self._latest = self.clock()
 
-    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As the base class; checkpoints hold the counts of skipped steps."""
-        super().setup(test_mode)
-        self.skipped = self.pipeline.training_state.skipped
-
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers. Raises PointSplatError if ``max_skipped_steps`` or ``seconds`` are out of range."""
-        if self.config.max_skipped_steps < 0:
-            raise PointSplatError(f"--max-skipped-steps {self.config.max_skipped_steps}: expected at least 0")
+        """The optimisers. Raises PointSplatError if ``seconds`` is out of range."""
         if self.config.seconds is not None and not 0 < self.config.seconds < math.inf:  # NaN fails too
             raise PointSplatError(f"--seconds {self.config.seconds:g}: expected a finite number above 0")
         optimizers = super().setup_optimizers()
@@ -73,13 +66,13 @@ class PointSplatTrainer(StoppableTrainer):
     def share(self, steps: int) -> float:
         """Share of the training that has passed after a number of steps; with ``seconds``, of the time."""
         if self.config.seconds is not None:
-            return self.pipeline.training_state.seconds / self.config.seconds
+            return self.pipeline.seconds / self.config.seconds
         return steps / max(1, self._start_step + self.config.max_num_iterations)
 
     def _load_checkpoint(self) -> None:
         """As nerfstudio's. Raises PointSplatError if the training has taken all of ``seconds`` before."""
         super()._load_checkpoint()
-        spent, seconds = self.pipeline.training_state.seconds, self.config.seconds
+        spent, seconds = self.pipeline.seconds, self.config.seconds
         if seconds is not None and spent >= seconds:
             raise PointSplatError(
                 f"--seconds {seconds:g}: the training has taken {spent:.0f} s up to its checkpoint; expected more, as "
@@ -90,22 +83,22 @@ class PointSplatTrainer(StoppableTrainer):
     def one_step(self, step: int):
         """As the base class, and a checkpoint if the latest one is old."""
         result = super().one_step(step)
-        if self.pipeline.training_state.seconds - self._seconds_of_checkpoint >= SECONDS_BETWEEN_CHECKPOINTS:
+        if self.pipeline.seconds - self._seconds_of_checkpoint >= SECONDS_BETWEEN_CHECKPOINTS:
             self.save_checkpoint(step)
         return result
 
     def update(self, step: int, names: list[str], skipped: bool) -> None:
         """As the base class. Before, count the time since the step before, and end the training after this one if the
         time is over. The first process's clock counts in all."""
-        state, now = self.pipeline.training_state, self.clock()
-        (state.seconds, *_), self._latest = processes.gathered([state.seconds + now - self._latest]), now
+        pipeline, now = self.pipeline, self.clock()
+        (pipeline.seconds, *_), self._latest = processes.gathered([pipeline.seconds + now - self._latest]), now
         if self.config.seconds is not None:
             share = self.share(step)
             # nerfstudio says the time left by the number of steps.
             writer.GLOBAL_BUFFER["max_iter"] = round((step + 1) / min(share, 1.0)) if share > 0 else sys.maxsize
             if share >= 1:
                 self.stop_training, self._last_step = True, step
-                CONSOLE.log(f"the time is over: {step + 1} steps in {state.seconds:.0f} s")
+                CONSOLE.log(f"the time is over: {step + 1} steps in {pipeline.seconds:.0f} s")
         super().update(step, names, skipped)
 
     def _after_train(self) -> None:
@@ -129,12 +122,7 @@ class PointSplatTrainer(StoppableTrainer):
         """Name of the scene of the latest step."""
         return self.pipeline.datamanager.scenes[metrics["scene"]].name
 
-    def too_many_skipped(self) -> str:
-        """More than ``max_skipped_steps`` in all."""
-        total, most = self.skipped.total(), self.config.max_skipped_steps
-        return f"{total} steps (more than --max-skipped-steps {most})" if total > most else ""
-
     def save_checkpoint(self, step: int) -> None:
         """As nerfstudio's; all processes call it, the first one writes."""
         super().save_checkpoint(step)
-        self._seconds_of_checkpoint = self.pipeline.training_state.seconds
+        self._seconds_of_checkpoint = self.pipeline.seconds

@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
 
-MOST_SKIPPED_IN_A_ROW = 10
-"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
-and names the photos. One broken photo among sound ones stops nothing."""
-
 _LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
 """Attributes of the datamanager: the frames that are still to come before any is repeated."""
 
@@ -73,7 +69,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
     config: SplatfactoCpuTrainerConfig
     pipeline: SplatfactoCpuPipeline
-    _skipped_in_a_row = 0
 
     def train(self) -> None:
         """As nerfstudio's."""
@@ -82,7 +77,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
 
     def update(self, step: int, names: list[str], skipped: bool) -> None:
         """As the base class; densification gathers nothing of a skipped step."""
-        self._skipped_in_a_row = self._skipped_in_a_row + 1 if skipped else 0
         if skipped:
             self.pipeline.model.forget_step()
         super().update(step, names, skipped)
@@ -90,11 +84,6 @@ class SplatfactoCpuTrainer(StoppableTrainer):
     def source_of(self, metrics: dict[str, Any]) -> str:
         """Name of the photo of the latest step."""
         return self.pipeline.datamanager.latest_photo
-
-    def too_many_skipped(self) -> str:
-        """More than :data:`MOST_SKIPPED_IN_A_ROW` in a row."""
-        many = self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW
-        return f"the last {self._skipped_in_a_row} steps" if many else ""
 
     def state_to_resume(self) -> dict[str, Any]:
         """Random numbers to come, the order of the photos, and what densification has gathered."""

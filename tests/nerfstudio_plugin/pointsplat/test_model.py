@@ -120,13 +120,13 @@ def test_a_scene_that_was_trained_again_counts_as_unseen(trained, trained_walls,
     pipeline = other.pipeline.setup(device="cpu", test_mode="test")
     state = torch.load(next(config.get_checkpoint_dir().iterdir()), weights_only=True)
     pipeline.load_pipeline(state["pipeline"], state["step"])
-    seen = [scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes]
+    seen = [scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes]
     assert seen == [True, False], "a run is the same wherever its folder is"
     timestamp = pipeline.datamanager.scenes[0].run.timestamp
     (again / "config.yml").write_text(text.replace(timestamp, "2031-01-01_000000"))
     pipeline = other.pipeline.setup(device="cpu", test_mode="test")
     pipeline.load_pipeline(state["pipeline"], state["step"])
-    assert not any(scene.identity in pipeline.training_state.trained_on for scene in pipeline.datamanager.scenes)
+    assert not any(scene.identity in pipeline.trained_on for scene in pipeline.datamanager.scenes)
 
 
 @pytest.fixture(scope="module")

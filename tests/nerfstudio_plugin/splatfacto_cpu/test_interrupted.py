@@ -19,7 +19,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.io import open_run, read_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu import trainer as trainer_module
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
 
@@ -191,7 +190,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, s
 def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
     wall_scene, wall_config, run_training, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(trainer_module, "MOST_SKIPPED_IN_A_ROW", 2)
+    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.trainer.MOST_SKIPPED_IN_A_ROW", 2)
     config = wall_config(wall_scene, tmp_path, 12)
     with broken("nan", range(3, 12, 2)):
         trainer, losses = run_training(config)
