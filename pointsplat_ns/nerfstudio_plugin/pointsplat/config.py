@@ -55,6 +55,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
+    gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
     steps_per_eval_batch: Suppress[Fixed[int]] = 0
     prompt: Suppress[Fixed[str | None]] = None
 
