@@ -172,12 +172,12 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
         (camera({"scale": float("nan")}), ["'scale': nan"]),
         (camera({"cy": float("inf")}), ["'cy': inf"]),
         (camera({"h": 6.5}), ["'h': 6.5", "whole ones of pixels"]),
-        (line(3, " ".join(["0"] * 15)), ["line 3 has 15 values"]),
+        (line(3, " ".join(["0"] * 15)), ["line 3: 15 values"]),
         (line(3, " ".join(["x"] * 16)), ["line 3: could not convert"]),
         (line(2, line_of(np.diag([1.1, 1.1, 1.1, 1]))), ["line 2 is no rigid pose"]),
         (line(2, line_of(np.diag([1, 1, -1, 1]))), ["line 2 is no rigid pose"]),
         (line(1, line_of(COLUMN_BY_COLUMN)), ["line 1 is no rigid pose", "last row 0 0 0 1"]),
-        (lambda scene: [edit_line(scene, i, " ".join(["nan"] * 16)) for i in (1, 2, 3, 4)], ["none of the 4 poses is"]),
+        (lambda scene: [edit_line(scene, i, " ".join(["nan"] * 16)) for i in (1, 2, 3, 4)], ["4 of 4 poses hold NaN"]),
     ],
 )
 def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, words):
