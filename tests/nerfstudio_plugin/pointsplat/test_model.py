@@ -184,7 +184,7 @@ def test_a_distorted_scene_of_degree_0_is_judged_as_its_own_run_judges_it(lens_r
 def test_pixel_losses_at_extremes(name, scale):
     """Value and gradient in float32 against float64; nothing differs, next to nothing differs, everything differs."""
     signs = scale * torch.tensor([1.0, -1.0, 0.5]).repeat(16).reshape(4, 4, 3)
-    found, exact = (signs.to(dtype).requires_grad_() for dtype in (torch.float32, torch.float64))
+    found, exact = (signs.to(dtype, copy=True).requires_grad_() for dtype in (torch.float32, torch.float64))
     values = [PIXEL_LOSSES[name](found), PIXEL_LOSSES[name](exact)]
     gradients = torch.autograd.grad(values, [found, exact])
     assert values[0].item() == pytest.approx(values[1].item(), rel=1e-5, abs=1e-9)
