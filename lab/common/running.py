@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.runs import METHOD_NAMES, open_run
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import JIT_SCRIPT
+from pointsplat_ns.nerfstudio_plugin.registration import JIT_SCRIPT
 
 TrainOptions = Mapping[str, Any]
 """Option name without its dashes -> value. A tuple or list becomes several words."""
@@ -72,7 +72,7 @@ def run(command: str, log: Path | None = None, threads: int | None = None, stop:
     beside = Path(sys.executable).parent / program
     # Waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
     # machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late.
-    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": JIT_SCRIPT.option, **os.environ}
+    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": JIT_SCRIPT, **os.environ}
     if threads is not None:
         environment["OMP_NUM_THREADS"] = str(threads)
     words = [str(beside) if beside.exists() else program, *arguments]

@@ -242,7 +242,7 @@ def _use_run(path: Path) -> object:
 def _use_dataset(path: Path) -> object:
     """``transforms.json`` of the photos that a run was trained on, which nerfstudio reads."""
     from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+    from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 
     import_nerfstudio()
     from nerfstudio.utils.rich_utils import CONSOLE

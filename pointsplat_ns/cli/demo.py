@@ -197,7 +197,7 @@ def run(about: str, words: list[Any], log: Path) -> None:
     """
     from pointsplat_ns.errors import PointSplatError
     from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE
-    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import JIT_SCRIPT
+    from pointsplat_ns.nerfstudio_plugin.registration import JIT_SCRIPT
 
     start = time.perf_counter()
     program, *arguments = map(str, words)
@@ -207,7 +207,7 @@ def run(about: str, words: list[Any], log: Path) -> None:
     environment = {
         # Threads that wait for one another spin briefly and then sleep: much faster where other programs run as well.
         "GOMP_SPINCOUNT": "20000",
-        "PYTHONWARNINGS": JIT_SCRIPT.option,
+        "PYTHONWARNINGS": JIT_SCRIPT,
         # Nothing is there: LPIPS is left out, whose weights are a download of 233 MB.
         WEIGHTS_VARIABLE: str(log.with_name("no_lpips_weights")),
         **os.environ,

@@ -1,8 +1,10 @@
-"""nerfstudio's cameras as views, and views as nerfstudio's cameras."""
+"""nerfstudio's cameras as views, views as nerfstudio's cameras, and the options of the rasterizer in both models."""
 
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -10,44 +12,72 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.backends import use_gsplat
+from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
+
+VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""Evaluation background of scenes trained with random backgrounds: the viewer's colour, as in Splatfacto."""
+
+
+@dataclass
+class RasterizerOptions:
+    """Choice of the rasterizer and its speed"""
+
+    backend: Literal["auto", "torch", "gsplat"] = "auto"
+    """Rasterizer: torch runs everywhere, gsplat needs CUDA, auto takes gsplat if its CUDA kernels are available."""
+    compiled: bool | None = None
+    """Draw with compiled kernels on a CPU: None if they were built, True warns if they were not, False leaves it to
+    torch, which is several times slower."""
+    quality: Literal["exact", "balanced", "fast"] = "exact"
+    """Accuracy that training gives up for speed (see docs/rasterizer.md). Evaluation is always exact."""
+
+    def engine(self, device: torch.device) -> str:
+        """Name of the rasterizer in use, a line for the log."""
+        if self.backend != "torch" and use_gsplat(self.backend, device):
+            return "rasterizer: gsplat"
+        if device.type != "cpu":
+            return "rasterizer: torch"
+        off = self.compiled is False
+        why = "as --pipeline.model.compiled is False" if off else blending.KERNELS.why_missing
+        return (
+            f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
+        )
+
+    def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
+        """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""
+        quality = self.quality if training else "exact"
+        return rasterization(**arguments, backend=self.backend, compiled=self.compiled, quality=quality)
 
 
 def cameras_of_views(views: Views) -> Cameras:
     """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes.
 
-    nerfstudio's cameras have no near plane and no ``eps2d``: these go into their metadata, where :func:`near_plane_of`
-    and :func:`eps2d_of` find them. The background and the rasterize mode are not carried over.
+    nerfstudio's cameras have no near plane and no ``eps2d``: these go into their metadata, where :func:`carried` finds
+    them. The background and the rasterize mode are not carried over.
     """
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    carried = {"near_plane": views.near_plane, "eps2d": views.eps2d}
-    metadata = {name: torch.full((len(views), 1), value, **DOUBLES) for name, value in carried.items()}
+    ours = {"near_plane": views.near_plane, "eps2d": views.eps2d}
+    metadata = {name: torch.full((len(views), 1), value, **DOUBLES) for name, value in ours.items()}
     kind = CameraType.PERSPECTIVE
     return Cameras(poses, fx, fy, cx, cy, views.width, views.height, camera_type=kind, metadata=metadata)
 
 
-def near_plane_of(cameras: Cameras) -> float:
-    """Near plane of cameras (C,), scene units; gsplat's if they do not come from :func:`cameras_of_views`. Raises
-    DataError if they have several."""
-    return _carried(cameras, "near_plane", NEAR_PLANE)
-
-
-def eps2d_of(cameras: Cameras) -> float:
-    """What cameras (C,) add to the diagonal of projected covariances, pixels^2; defaults and errors as of
-    :func:`near_plane_of`."""
-    return _carried(cameras, "eps2d", EPS2D)
-
-
-def _carried(cameras: Cameras, name: str, default: float) -> float:
-    values = (cameras.metadata or {}).get(name)
-    if values is None or values.numel() == 0:
-        return default
-    different = values.unique().tolist()
-    if len(different) != 1:
-        raise DataError(f"cameras of {len(different)} values of {name}; expected one for all views")
-    return different[0]
+def carried(cameras: Cameras) -> dict[str, float]:
+    """``near_plane``, in scene units, and ``eps2d``, in pixels^2, of cameras (C,); gsplat's if they do not come from
+    :func:`cameras_of_views`. Raises DataError if the cameras differ in them."""
+    found = {"near_plane": NEAR_PLANE, "eps2d": EPS2D}
+    for name in found:
+        values = (cameras.metadata or {}).get(name)
+        if values is not None and values.numel() > 0:
+            different = values.unique().tolist()
+            if len(different) != 1:
+                raise DataError(f"cameras of {len(different)} values of {name}; expected one for all views")
+            (found[name],) = different
+    return found
 
 
 def need_pinhole(camera: Cameras) -> None:
@@ -73,5 +103,5 @@ def views_of_cameras(cameras: Cameras, background: Tensor, rasterize_mode: Raste
         raise DataError(f"photos of {len(sizes)} sizes; expected one size for all views")
     ((width, height),) = sizes
     viewmats = viewmats_from_opengl(cameras.camera_to_worlds)
-    carried = near_plane_of(cameras), eps2d_of(cameras)
-    return Views(viewmats, cameras.get_intrinsics_matrices(), width, height, background, rasterize_mode, *carried)
+    Ks = cameras.get_intrinsics_matrices()
+    return Views(viewmats, Ks, width, height, background, rasterize_mode, **carried(cameras))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.errors import DataError, PointSplatError
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 
 if TYPE_CHECKING:
     from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
@@ -61,7 +61,7 @@ def dataparser_for(capture: Path) -> DataParserConfig:
     from pointsplat_ns.nerfstudio_plugin.replica.layout import NICE_SLAM, SEMANTIC_NERF
     from pointsplat_ns.nerfstudio_plugin.scannetpp import SOURCES, SeededScanNetppDataParserConfig
 
-    if (capture / "dslr").is_dir() or any((capture / source.transforms).is_file() for source in SOURCES):
+    if (capture / "dslr").is_dir() or any((capture / source["transforms_path"]).is_file() for source in SOURCES):
         return SeededScanNetppDataParserConfig()
     if any((capture / names.trajectory).is_file() for names in (NICE_SLAM, SEMANTIC_NERF)):
         return ReplicaDataParserConfig()

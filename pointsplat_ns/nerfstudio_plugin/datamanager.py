@@ -7,7 +7,6 @@ pins their memory, which raises without CUDA.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -18,7 +17,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, to_device
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 if TYPE_CHECKING:
@@ -90,18 +89,12 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
 
     def _frames_of(self, dataset: UndistortedDataset) -> Frames:
         workers = self.config.max_thread_workers or 2
-        return Frames(dataset, self.config.cache_images_type, self.frame_cache, workers)
-
-    def _load_images(
-        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
-    ) -> list[dict[str, torch.Tensor]]:
-        """Every photo of a split at once, in main memory, for nerfstudio code that asks for all of them."""
-        return [data for _, data in (self.train_frames if split == "train" else self.eval_frames)]
+        return Frames(dataset, self.config.cache_images_type, self.frame_cache, workers, self.device)
 
     @property
-    def fixed_indices_eval_dataloader(self) -> _EvalLoader:  # type: ignore[override]  # nerfstudio's is a list
+    def fixed_indices_eval_dataloader(self) -> Frames:  # type: ignore[override]  # nerfstudio's is a list
         """Every held-out frame in order, decoded one after the other."""
-        return _EvalLoader(self.eval_frames, self.device)
+        return self.eval_frames
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a training photo (the first one's, if they differ)."""
@@ -114,9 +107,8 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
         self.latest_photo = self.train_dataset.image_filenames[index].name
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self.sample_train_cameras()
-        frame = self.train_frames[index]
+        camera, data = self.train_frames[index]
         self.train_frames.prefetch(self.train_unseen_cameras[: self.train_frames.look_ahead])
-        camera, data = to_device(frame, self.device)
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, data
 
@@ -125,18 +117,4 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
         index = self.eval_unseen_cameras.pop(random.randint(0, len(self.eval_unseen_cameras) - 1))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        return to_device(self.eval_frames[index], self.device)
-
-
-class _EvalLoader:
-    """``(camera, data)`` of every held-out frame, on a device, one at a time."""
-
-    def __init__(self, frames: Frames, device: torch.device | str):
-        self._frames = frames
-        self._device = device
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (to_device(frame, self._device) for frame in self._frames)
+        return self.eval_frames[index]

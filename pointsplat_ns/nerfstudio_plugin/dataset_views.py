@@ -21,7 +21,7 @@ from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
@@ -78,9 +78,7 @@ def dataset_photos(
     """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and the views on the CPU that
     they show once undistorted. Arguments and errors are those of :func:`dataset_views`; a photo that cannot be used is
     a DataError."""
-    scene, frames = _open(path, split, data)
-    if split == "train":
-        _need_as_rendered(scene)
+    scene, frames = _open(path, split, data, photos=True)
     poses = _views_of(scene, frames, split)
     shown = [frames[index] for index in spread_indices(len(frames), count)]
     photos = [in_unit_range(content["image"][..., :3]).float() for _, content in shown]
@@ -107,8 +105,7 @@ def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None
 def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:
     """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, "train", data, cached=True)
-    _need_as_rendered(scene)
+    scene, frames = _open(path, "train", data, photos=True)
     _views_of(scene, frames, "train")
     return TrainingPhotos(scene, frames)
 
@@ -140,12 +137,13 @@ class TrainingPhotos(Sequence[Example]):
         from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
 
         camera, data = self._frames[index]
-        view = views_of_cameras(camera.to("cpu"), self._scene.background, self._scene.rasterize_mode)[0]
+        view = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
         return Example(view, data["image"][..., :3], data.get("mask"))
 
 
-def _open(path: Path | str, split: Split, data: Path | str | None, cached: bool = False) -> tuple[TrainedScene, Frames]:
-    """The scene of a run, and the frames of a split, which stay in memory as far as there is room if ``cached``."""
+def _open(path: Path | str, split: Split, data: Path | str | None, photos: bool = False) -> tuple[TrainedScene, Frames]:
+    """The scene of a run, and the frames of a split. With ``photos``, these stay in memory as far as there is room, and
+    training photos that colours were fitted to are a DataError."""
     run = open_run(path, data=data)  # before nerfstudio is imported, which takes seconds
     try:
         need("nerfstudio", "reading the photos and poses of a run")
@@ -154,16 +152,12 @@ def _open(path: Path | str, split: Split, data: Path | str | None, cached: bool 
     import_nerfstudio()
 
     from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, need_photos_as_rendered
 
-    scene = TrainedScene(scene_name(run), run, MemoryCache.of() if cached else MemoryCache(0))
+    if photos and split == "train":
+        need_photos_as_rendered(run, "leave the photos out")
+    scene = TrainedScene(scene_name(run), run, MemoryCache.of() if photos else MemoryCache(0))
     return scene, scene.train_frames if split == "train" else scene.eval_frames
-
-
-def _need_as_rendered(scene: TrainedScene) -> None:
-    from pointsplat_ns.nerfstudio_plugin.corrected_poses import need_photos_as_rendered
-
-    need_photos_as_rendered(scene.run, "leave the photos out")
 
 
 def _views_of(scene: TrainedScene, frames: Frames, split: Split) -> Views:

@@ -1,13 +1,11 @@
-"""Posed photos, loaded lazily, and a cache of bounded size for photos, scenes and renders.
-
-Threads decode photos a few steps ahead. The cache keeps the decoded ones.
-"""
+"""Posed photos, loaded lazily, and a cache of bounded size for photos, scenes and renders."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import threading
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Literal
@@ -23,7 +21,6 @@ class MemoryCache:
     of 0 keeps nothing. Safe to share among threads. Values are not copied: do not write to them."""
 
     def __init__(self, max_bytes: int):
-        self.max_bytes = max_bytes
         self._entries: LRUCache[Hashable, tuple[Any, int]] = LRUCache(max_bytes, getsizeof=lambda entry: entry[1])
         self._lock = threading.Lock()
 
@@ -43,13 +40,23 @@ class MemoryCache:
             entry = self._entries.get(key)
         return None if entry is None else entry[0]
 
-    def put(self, key: Hashable, value: Any, num_bytes: int) -> None:
-        """Store a value, not None, and drop the least recently used ones until the bound holds. An earlier value of the
-        same key is replaced. A value larger than the whole cache is not stored."""
+    def put(self, key: Hashable, value: Any) -> None:
+        """Store a value, not None, by the size of its tensors, and drop the least recently used ones until the bound
+        holds. A value larger than the whole cache is not stored."""
+        size = tensor_bytes(value)
         with self._lock:
-            self._entries.pop(key, None)
-            if num_bytes <= self.max_bytes:
-                self._entries[key] = value, num_bytes
+            if size <= self._entries.maxsize:
+                self._entries[key] = value, size
+
+
+def tensor_bytes(value: Any) -> int:
+    """Bytes of all tensors in a dictionary, list, tuple or dataclass, at any depth."""
+    if isinstance(value, torch.Tensor):
+        return value.nbytes
+    if dataclasses.is_dataclass(value):
+        value = vars(value)
+    parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    return sum(map(tensor_bytes, parts))
 
 
 Frame = tuple[Cameras, dict[str, Any]]
@@ -63,9 +70,9 @@ class Frames:
 
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
-    masks, and ``image_idx``. So training and evaluation see the same pinhole camera whatever the lens. The tensors are
-    shared with the cache, which by default takes a quarter of the free memory: do not write to them. ``max_workers``
-    threads decode ahead. A photo or mask that cannot be used is a DataError.
+    masks, and ``image_idx``, all on ``device``. The tensors are shared with the cache, which by default takes a quarter
+    of the free memory: do not write to them. ``max_workers`` threads decode ahead, if any. A photo or mask that cannot
+    be used is a DataError.
     """
 
     look_ahead = 4
@@ -78,13 +85,13 @@ class Frames:
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
         max_workers: int = 2,
+        device: torch.device | str = "cpu",
     ):
-        self.dataset = dataset
+        self.dataset, self.device = dataset, device
         self.image_type: Literal["uint8", "float32"] = image_type
         self.cache = MemoryCache.of() if cache is None else cache
         self._owner = object()
-        self._max_workers = max_workers
-        self._pool: ThreadPoolExecutor | None = None
+        self._pool = ThreadPoolExecutor(max_workers, "frames") if max_workers > 0 else None  # starts threads when used
         self._loading: dict[int, Future[Frame]] = {}
         self._lock = threading.Lock()
 
@@ -92,16 +99,13 @@ class Frames:
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Frame:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        index %= len(self)
+        index = range(len(self))[index]
         with self._lock:
             loading = self._loading.get(index)
         frame = loading.result() if loading is not None else self.cache.get(("photo", self._owner, index))
-        if frame is None:
-            frame = self._load_and_keep(index)
-        camera, data = frame
-        return copy.deepcopy(camera), data.copy()
+        camera, data = self._load(index) if frame is None else frame
+        moved = {name: data[name].to(self.device) for name in ("image", "mask") if name in data}
+        return copy.deepcopy(camera).to(self.device), {**data, **moved}
 
     def __iter__(self) -> Iterator[Frame]:
         for index in range(len(self)):
@@ -110,39 +114,21 @@ class Frames:
 
     def prefetch(self, indices: Iterable[int]) -> None:
         """Start decoding photos that will be needed soon. An error is raised when the photo is asked for."""
+        if self._pool is None:
+            return
         for index in indices:
             with self._lock:
                 if index in self._loading or self.cache.get(("photo", self._owner, index)) is not None:
                     continue
-                if self._pool is None:
-                    self._pool = ThreadPoolExecutor(self._max_workers, thread_name_prefix="frames")
-                future = self._pool.submit(self._load_and_keep, index)
-                self._loading[index] = future
+                self._loading[index] = future = self._pool.submit(self._load, index)
             future.add_done_callback(partial(self._forget, index))
 
     def _forget(self, index: int, _: Future[Frame]) -> None:
         with self._lock:
             self._loading.pop(index, None)
 
-    def _load_and_keep(self, index: int) -> Frame:
-        frame = self._load(index)
-        self.cache.put(("photo", self._owner, index), frame, _bytes_of(frame[1]))
-        return frame
-
     def _load(self, index: int) -> Frame:
         data = self.dataset.get_data(index, image_type=self.image_type)
-        return self.dataset.cameras[index : index + 1], data
-
-
-def _bytes_of(data: dict[str, Any]) -> int:
-    """Size of the tensors among a photo's data."""
-    return sum(value.numel() * value.element_size() for value in data.values() if isinstance(value, torch.Tensor))
-
-
-def to_device(frame: Frame, device: torch.device | str) -> Frame:
-    """A camera and its photo on a device."""
-    camera, data = frame
-    for name in ("image", "mask"):
-        if name in data:
-            data[name] = data[name].to(device)
-    return camera.to(device), data
+        frame = self.dataset.cameras[index : index + 1], data
+        self.cache.put(("photo", self._owner, index), frame)
+        return frame

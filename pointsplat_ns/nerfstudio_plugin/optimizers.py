@@ -1,13 +1,11 @@
-"""The optimiser of both methods' trainings, the learning rates of short ones, and the check of gradients."""
+"""The optimiser of both methods' trainings, and the learning rates of short ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
-from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -43,11 +41,3 @@ class FallingRate(Scheduler):
         """torch's scheduler of an optimiser; ``lr_init`` is the optimiser's rate, which it has already."""
         first, last, length = self.config.first, self.config.last, self.config.max_steps
         return LambdaLR(optimizer, lambda step: first * (last / first) ** min(1.0, step / length))
-
-
-def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether all numbers are finite.
-
-    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, each number is checked.
-    """
-    return all(bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all()) for tensor in tensors)

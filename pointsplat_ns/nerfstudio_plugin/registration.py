@@ -1,13 +1,35 @@
-"""Registration with nerfstudio that cannot break nerfstudio's own commands, and errors in one line there."""
+"""Registration with nerfstudio that cannot break its commands; errors there in one line; warnings that nobody can help.
+
+:data:`JIT_SCRIPT` is raised before nerfstudio loads any plugin, so nothing here can silence it in a ``ns-*`` command.
+"""
 
 from __future__ import annotations
 
+import importlib
+import re
 import sys
+import warnings
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
+
+JIT_SCRIPT = "ignore:`torch.jit.script` is deprecated:FutureWarning:torch.jit._script"
+"""Value of the environment variable PYTHONWARNINGS that hides a warning: nerfstudio scripts a function at import."""
+
+NERFSTUDIO = (
+    # Decorators of nerfstudio's NeRF methods, at import.
+    ("`torch.cuda.amp.custom_fwd(args...)` is deprecated", FutureWarning, "nerfstudio.field_components.activations"),
+    ("`torch.cuda.amp.custom_bwd(args...)` is deprecated", FutureWarning, "nerfstudio.field_components.activations"),
+    # The trainer's constructor.
+    ("`torch.cuda.amp.GradScaler(args...)` is deprecated", FutureWarning, "nerfstudio.engine.trainer"),
+    # Losses are written to the log with their graph.
+    ("Converting a tensor with requires_grad=True to a scalar", UserWarning, "nerfstudio.utils.writer"),
+    # The standard deviation over a single held-out photo, which the evaluation then reports as None.
+    ("std_mean(): degrees of freedom is <= 0", UserWarning, "nerfstudio.pipelines.base_pipeline"),
+)
+"""Warnings of nerfstudio's modules that a user can do nothing about: beginning of the text, category, module."""
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
@@ -23,24 +45,35 @@ def load_specification(name: str, build: Callable[[], Any]) -> Any:
         return f"{name} of pointsplat-ns, which failed to load ({type(error).__name__}: {error})"
 
 
-class _OneLineHook:
-    """Prints a :class:`PointSplatError` in one line; passes any other exception on to the previous hook."""
-
-    def __init__(self, before: Callable[..., object]):
-        self._before = before
-
-    def __call__(self, kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
-        if isinstance(error, PointSplatError):
-            print(f"error: {error}", file=sys.stderr)
-        else:
-            self._before(kind, error, traceback)
-
-
 def errors_in_one_line() -> None:
     """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit status is 1.
 
-    nerfstudio's commands catch nothing, so a missing photo would print a page of traceback. Calling this again changes
-    nothing.
+    nerfstudio's commands catch nothing, so a missing photo would print a page of traceback.
     """
-    if not isinstance(sys.excepthook, _OneLineHook):
-        sys.excepthook = _OneLineHook(sys.excepthook)
+    before = sys.excepthook
+
+    def print_error(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if isinstance(error, PointSplatError):
+            print(f"error: {error}", file=sys.stderr)
+        else:
+            before(kind, error, traceback)
+
+    sys.excepthook = print_error
+
+
+def quiet_nerfstudio() -> None:
+    """Ignore the warnings in :data:`NERFSTUDIO`, and no others, from now on in this process."""
+    for text, category, module in NERFSTUDIO:
+        warnings.filterwarnings("ignore", re.escape(text), category, re.escape(module) + r"\Z")
+
+
+def import_nerfstudio() -> None:
+    """Import the first modules of nerfstudio without the warnings that come with it.
+
+    Call it in code that nerfstudio does not run itself, before importing any module that needs nerfstudio. nerfstudio
+    loads plugins while it is itself only half imported; after this call its modules can be imported in any order.
+    """
+    quiet_nerfstudio()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script` is deprecated", FutureWarning)
+        importlib.import_module("nerfstudio.cameras.camera_utils")

@@ -22,30 +22,20 @@ from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.io.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
-
-@dataclass(frozen=True)
-class Source:
-    """Photos of a ScanNet++ scene, by their places in its folder."""
-
-    transforms: str
-    images: str
-    masks: str
-    colmap: str
-
-
-DSLR = Source("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap")
-
-SOURCES = (
-    DSLR,
-    # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
-    Source(
-        "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
-        "dslr/colmap",
-    ),
-    Source("nerfstudio/transforms.json", "images", "masks", "colmap"),
-    Source("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
+SOURCES: tuple[dict[str, Any], ...] = tuple(
+    dict(zip(("transforms_path", "images_dir", "masks_dir", "colmap_path"), map(Path, paths), strict=True))
+    for paths in (
+        ("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap"),
+        # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
+        (
+            "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
+            "dslr/colmap",
+        ),
+        ("nerfstudio/transforms.json", "images", "masks", "colmap"),
+        ("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
+    )
 )  # fmt: skip
-"""All that a scene may have. The first whose photos are there is used."""
+"""All photos that a scene may have, as settings of the dataparser. The first whose files are there are used."""
 
 
 @dataclass
@@ -63,7 +53,7 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
     """Leave out frames with is_bad: blurred ones, or with shadows of the photographer."""
     load_seed_points: bool = True
     """Start from COLMAP's points."""
-    colmap_path: Path = Path(DSLR.colmap)
+    colmap_path: Path = SOURCES[0]["colmap_path"]
     """Relative path to COLMAP's images and points3D, as text or binary files."""
     train_split_fraction: float | None = None
     """Train on this share of all photos and hold out the others, evenly spread, whatever the lists say."""
@@ -94,11 +84,25 @@ class SeededScanNetpp(ScanNetpp):
                 outputs = super()._generate_dataparser_outputs(split)
         finally:
             self.config = given
-        where = f"{located.data / located.transforms_path}: {split} split"
-        outputs = _without(outputs, hidden, photos, where, "are hidden, and left out")
-        if self.config.skip_bad:
-            bad = {name for name, frame in frames.items() if frame.get("is_bad")}
-            outputs = _without(outputs, bad, photos, where, "are marked is_bad, and left out")
+        bad = {name for name, frame in frames.items() if self.config.skip_bad and frame.get("is_bad")}
+        names = [str(path.relative_to(photos)) for path in outputs.image_filenames]
+        kept = [i for i, name in enumerate(names) if name not in hidden | bad]
+        if len(kept) < len(names):
+            where = f"{located.data / located.transforms_path}: {split} split"
+            if not kept:
+                raise DataError(
+                    f"{where}: all {len(names)} frames are hidden or marked is_bad; expected one that is not; "
+                    "--skip-bad False takes bad ones"
+                )
+            missing = sum(name in hidden for name in names)
+            CONSOLE.log(
+                f"{where}: of {len(names)} frames {len(names) - len(kept) - missing} that are marked is_bad and "
+                f"{missing} that are hidden are left out"
+            )
+            outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
+            if outputs.mask_filenames is not None:
+                outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
+            outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
         if split == "train" and self.config.load_seed_points:
             outputs.metadata.update(self._seed_points(frames, outputs, located.data / located.colmap_path))
         return outputs
@@ -107,15 +111,12 @@ class SeededScanNetpp(ScanNetpp):
         self, frames: dict[str, dict[str, Any]], outputs: DataparserOutputs, folder: Path
     ) -> dict[str, Tensor]:
         """The points of a COLMAP model in the frame of the outputs."""
-        if not folder.is_dir():
-            CONSOLE.log(f"{folder}: no such folder, so no seed points; training starts from random ones")
+        if not folder.is_dir() or not (points := _read(folder, "points3D").values()):
+            CONSOLE.log(f"{folder}: no points of COLMAP, so no seed points; training starts from random ones")
             return {}
-        poses = {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}
-        move = _frame_of(folder, poses)
-        points = _read(folder, "points3D").values()
-        if not points:
-            CONSOLE.log(f"{folder}: no points, so no seed points; training starts from random ones")
-            return {}
+        move = _frame_of(
+            folder, {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}
+        )
         xyz = np.array([point.xyz for point in points]) @ move[:3, :3].T + move[:3, 3]
         transform = outputs.dataparser_transform.double()
         placed = torch.from_numpy(xyz) @ transform[:, :3].T + transform[:, 3]
@@ -128,12 +129,10 @@ class SeededScanNetpp(ScanNetpp):
 def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:
     """The config with the paths of the first source whose photos are there. It stays as it is if one of its paths was
     given, or there is no source."""
-    places = {"transforms_path": "transforms", "images_dir": "images", "masks_dir": "masks", "colmap_path": "colmap"}
-    if all(Path(getattr(config, name)) == Path(getattr(DSLR, place)) for name, place in places.items()):
+    if all(Path(getattr(config, name)) == path for name, path in SOURCES[0].items()):
         for source in SOURCES:
-            if (config.data / source.transforms).is_file() and (config.data / source.images).is_dir():
-                paths: dict[str, Any] = {name: Path(getattr(source, place)) for name, place in places.items()}
-                return dataclasses.replace(config, **paths)
+            if (config.data / source["transforms_path"]).is_file() and (config.data / source["images_dir"]).is_dir():
+                return dataclasses.replace(config, **source)
     return config
 
 
@@ -185,23 +184,6 @@ def _below(photos: Path, name: str) -> str:
     """The path of a photo in its folder, from a path that may begin with the folder's name."""
     first, _, rest = name.partition("/")
     return rest if rest and first == photos.name and not (photos / name).is_file() else name
-
-
-def _without(outputs: DataparserOutputs, left_out: set[str], photos: Path, where: str, are: str) -> DataparserOutputs:
-    """The outputs without some photos, by their paths below ``photos``, which is logged. Raises DataError if none is
-    left."""
-    kept = [i for i, path in enumerate(outputs.image_filenames) if str(path.relative_to(photos)) not in left_out]
-    count = len(outputs.image_filenames)
-    if len(kept) == count:
-        return outputs
-    if not kept:
-        raise DataError(f"{where}: all {count} frames {are}; expected one that is not; --skip-bad False takes bad ones")
-    CONSOLE.log(f"{where}: {count - len(kept)} of {count} frames {are}")
-    outputs.image_filenames = [outputs.image_filenames[i] for i in kept]
-    if outputs.mask_filenames is not None:
-        outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
-    outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
-    return outputs
 
 
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:

@@ -42,8 +42,7 @@ class UndistortedDataset(InputDataset):
             self.cameras.width, self.cameras.height = (
                 (size.double() * scale_factor).long() for size in (given.width, given.height)
             )
-        _need_finite(self)
-        _need_one_time(self)
+        _need_sound_cameras(self)
         self.lens_cameras = self.cameras
         self.cameras = self._pinholes()
 
@@ -98,18 +97,11 @@ class UndistortedDataset(InputDataset):
             else:
                 pinholes[kind] = every[first, :6]
         fx, fy, cx, cy, width, height = pinholes[kind_of].split(1, dim=1)
+        intrinsics = fx.float(), fy.float(), cx.float(), cy.float(), width.long(), height.long()
         return Cameras(
-            camera_to_worlds=cameras.camera_to_worlds,
-            fx=fx.float(),
-            fy=fy.float(),
-            cx=cx.float(),
-            cy=cy.float(),
-            width=width.long(),
-            height=height.long(),
-            camera_type=CameraType.PERSPECTIVE,
-            times=cameras.times,
+            cameras.camera_to_worlds, *intrinsics, camera_type=CameraType.PERSPECTIVE, times=cameras.times,
             metadata=cameras.metadata,
-        )
+        )  # fmt: skip
 
 
 def _has_lens(cameras: Cameras) -> Tensor:
@@ -139,25 +131,20 @@ def _undistorted(
     return K, image, mask
 
 
-def _need_finite(dataset: InputDataset) -> None:
-    """Refuse cameras with NaN or infinity; the error names the first photo."""
-    cameras = dataset.cameras
+def _need_sound_cameras(dataset: InputDataset) -> None:
+    """Refuse cameras with NaN or infinity, and photos of a scene that moves. Those without times are taken to be of a
+    still scene."""
+    cameras, paths = dataset.cameras, dataset.image_filenames
     numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
     bad = (~torch.cat([part.double() for part in numbers], dim=1).isfinite().all(dim=1)).nonzero()[:, 0].tolist()
     if bad:
         raise DataError(
-            f"{dataset.image_filenames[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, as "
-            f"do those of {len(bad) - 1} more of {len(cameras)}; expected numbers; correct them or leave the photo out"
+            f"{paths[bad[0]]}: the pose or the intrinsics of frame {bad[0]} hold NaN or infinity, as do those of "
+            f"{len(bad) - 1} more of {len(cameras)}; expected numbers; correct them or leave the photo out"
         )
-
-
-def _need_one_time(dataset: InputDataset) -> None:
-    """Refuse photos of a scene that moves. Photos without times are taken to be of a still scene."""
-    times = dataset.cameras.times
-    count = 1 if times is None else len(times.unique())
-    if count > 1:
+    if cameras.times is not None and len(cameras.times.unique()) > 1:
         raise DataError(
-            f"{dataset.image_filenames[0].parent}: its {len(dataset.cameras)} photos are of {count} different times; "
+            f"{paths[0].parent}: its {len(cameras)} photos are of {len(cameras.times.unique())} different times; "
             "expected photos of a scene that does not move, as Gaussians here have no time; take the photos of one "
             "moment"
         )

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import json
 import shlex
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, eps2d_of, near_plane_of, views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, carried, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
@@ -57,8 +56,9 @@ def test_a_view_sees_a_point_at_the_pixel_of_nerfstudios_ray(views):
 def test_near_plane_and_eps2d_go_to_nerfstudios_cameras_and_back(views, near_plane, eps2d):
     cameras = cameras_of_views(dataclasses.replace(views, near_plane=near_plane, eps2d=eps2d))
     for some in (cameras, cameras[1:2], copy.deepcopy(cameras).to("cpu")):
-        assert near_plane_of(some) == near_plane == views_of_cameras(some, BACKGROUND).near_plane
-        assert eps2d_of(some) == eps2d == views_of_cameras(some, BACKGROUND).eps2d
+        assert carried(some) == {"near_plane": near_plane, "eps2d": eps2d}
+        again = views_of_cameras(some, BACKGROUND)
+        assert (again.near_plane, again.eps2d) == (near_plane, eps2d)
 
 
 def test_cameras_of_several_near_planes_or_sizes_are_refused(views):
@@ -96,8 +96,6 @@ def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
         assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
     seen = [lazy.next_eval(step)[1]["image_idx"] for step in range(len(ours))]
     assert sorted(seen) == list(range(len(ours)))
-    assert [d["image_idx"] for d in lazy.cached_train] == list(range(len(lazy.train_dataset)))
-    assert torch.equal(lazy.cached_eval[1]["image"], theirs[1][1]["image"])
 
 
 @pytest.fixture()
@@ -114,19 +112,11 @@ def mean_psnr(scene: Gaussians, run: Path) -> float:
     return float(torch.stack(errors).mean())
 
 
-def test_a_run_is_measured_against_its_held_out_photos(run, tmp_path, plain_page, no_lpips, monkeypatch):
-    found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none",))
-    dense, small = found.points
-    assert dense.against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)
-    assert small.against_photos is not None and small.gaussians < dense.gaussians
-    assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
-    written = json.loads((tmp_path / "trade" / "tradeoff.json").read_text())
-    assert written["points"][0]["against_photos"]["psnr"] == dense.against_photos.psnr
-
-
 def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, plain_page, no_lpips, monkeypatch):
     monkeypatch.setitem(PHOTO_STEPS, "quick", 96)
     found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none", "photos"))
+    assert found.points[0].against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)
+    assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
     trained = next(point for point in found.points if point.repair == "photos")
     pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
     assert trained.against_photos.psnr > pruned.against_photos.psnr + 0.1

@@ -199,7 +199,7 @@ def rename_photos(scene: Path) -> None:
     [
         (spoil_pose, "poses of 10 photos are not those of transforms.json.*--load-seed-points False"),
         (rename_photos, "knows none of the 10 photos by name"),
-        (mark_all, "train split: all 7 frames are marked is_bad.*--skip-bad False"),
+        (mark_all, "train split: all 7 frames are hidden or marked is_bad.*--skip-bad False"),
         (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
         (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
         (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),
@@ -231,6 +231,9 @@ def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, c
         "hidden poses count in the frame"
     )
     assert "photos of the test are hidden" in " ".join(capsys.readouterr().out.split())
+    meta = json.loads((scene / TRANSFORMS).read_text())
+    change(own_scene, frames=meta["frames"], test_frames=None)  # no lists either: every tenth is held out
+    assert [len(numbers(parsed(own_scene, split, skip_bad=False))) for split in ("train", "test")] == [6, 1]
 
 
 def test_photos_are_held_out_by_the_lists_where_there_are_no_test_frames(own_scene, scene):
@@ -241,13 +244,6 @@ def test_photos_are_held_out_by_the_lists_where_there_are_no_test_frames(own_sce
     (own_scene / "dslr/train_test_lists.json").write_text(json.dumps(lists))
     for split in ("train", "test"):
         assert numbers(parsed(own_scene, split)) == numbers(parsed(scene, split))
-
-
-def test_without_lists_every_tenth_photo_is_held_out(own_scene):
-    meta = json.loads((own_scene / TRANSFORMS).read_text())
-    change(own_scene, frames=meta["frames"] + meta["test_frames"], test_frames=None)
-    assert len(numbers(parsed(own_scene, "test", skip_bad=False))) == 1
-    assert len(numbers(parsed(own_scene, skip_bad=False))) == FRAMES - 1
 
 
 def test_a_fraction_splits_as_nerfstudio_splits_colmap_models(scene, tmp_path):

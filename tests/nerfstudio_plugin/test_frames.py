@@ -102,17 +102,6 @@ def test_reduced_photos_are_of_the_size_of_their_cameras(tmp_path, scale):
         assert (int(camera.width), int(camera.height)) == (image.shape[1], image.shape[0])
 
 
-def test_negative_indices_count_from_the_end_and_outside_is_an_index_error(tmp_path):
-    image = Frames(make_dataset(tmp_path), image_type="float32")[0][1]["image"]
-    assert image.dtype == torch.float32 and 0 <= image.min() and image.max() <= 1
-    frames = Frames(make_dataset(tmp_path))
-    assert frames[-1][1]["image_idx"] == 4 and len(frames) == 5
-    for index in (5, -6):
-        with pytest.raises(IndexError, match="of 5"):
-            frames[index]
-    assert [data["image_idx"] for _, data in frames] == [0, 1, 2, 3, 4]
-
-
 def test_prefetched_photos_are_decoded_once_by_another_thread(tmp_path):
     dataset = make_dataset(tmp_path)
     frames = Frames(dataset)
@@ -136,28 +125,26 @@ def test_writing_to_what_was_handed_out_does_not_change_the_next(tmp_path):
     camera, data = frames[0]
     camera.rescale_output_resolution(0.5)
     del data["image"]
-    camera, data = frames[0]
+    camera, data = frames[-5]
     assert int(camera.width) == WIDTH and "image" in data
+    with pytest.raises(IndexError):
+        frames[5]
 
 
 @pytest.mark.parametrize(
     ("damage", "prefetched"),
-    [("missing", True), ("truncated", False), ("text", False), ("other size", False), ("mask", True)],
+    [("missing", True), ("truncated", False), ("other size", False), ("mask", True)],
 )
 def test_a_bad_photo_is_named(tmp_path, damage, prefetched):
     frames = Frames(make_dataset(tmp_path, masks=True))
     photo = tmp_path / "photo2.png"
-    if damage == "missing":
-        photo.unlink()
-    elif damage == "truncated":
+    if damage == "truncated":
         photo.write_bytes(photo.read_bytes()[:200])
-    elif damage == "text":
-        photo.write_text("not a photo")
     elif damage == "other size":
         for path in (photo, tmp_path / "mask2.png"):
             cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH + 2, 3 if path == photo else 1), np.uint8))
     else:
-        (tmp_path / "mask2.png").unlink()
+        (tmp_path / "mask2.png" if damage == "mask" else photo).unlink()
     if prefetched:
         frames.prefetch([2])
     with pytest.raises(DataError, match="mask2.png" if damage == "mask" else "photo2.png"):
@@ -193,12 +180,10 @@ def test_only_photos_that_nerfstudio_reads_rightly_are_read(tmp_path, mode):
         assert Frames(dataset)[2][1]["image"].shape == (HEIGHT, WIDTH, 4 if mode == "RGBA" else 3)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation, scale):
+def test_a_photo_that_its_exif_turns_is_said(tmp_path, orientation):
     """The camera is that of the turned photo; the pixels are stored as the sensor had them."""
-    dataset = make_dataset(tmp_path, scale=scale)
-    dataset.cameras.rescale_output_resolution(scale)
+    dataset = make_dataset(tmp_path)
     exif = Image.Exif()
     exif[274] = orientation
     Image.new("RGB", (HEIGHT, WIDTH)).save(dataset.image_filenames[2], exif=exif)
@@ -226,10 +211,11 @@ def test_the_bound_holds_while_many_threads_put_and_get():
     def work(seed):
         for step in range(300):
             number = (7 * step + seed) % 12
-            cache.put(number, str(number), 1 + number % 4)
-            if cache.num_bytes > cache.max_bytes:
+            cache.put(number, [number, torch.zeros(1 + number % 4, dtype=torch.uint8)])
+            if cache.num_bytes > 10:
                 above.append(cache.num_bytes)
-            if cache.get(number) not in (None, str(number)):
+            found = cache.get(number)
+            if found is not None and found[0] != number:
                 wrong.append(number)
 
     threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]

@@ -5,15 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
-import torchvision
-from nerfstudio.scripts import exporter
 
 import pointsplat_ns as ps
 from making import SHARED_DATA
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
@@ -49,39 +45,3 @@ def test_its_renders_show_its_held_out_photos(run):
     alike = torch.corrcoef(torch.stack([*grey, *seen]))[:5, 5:]
     # a ninth of a scene just behind a reset of its opacities is dark: its PSNR tells nothing, its structure does
     assert torch.equal(alike.argmax(dim=0), torch.arange(5)), alike  # the render that is most like each photo
-
-
-def test_it_is_pruned_refined_and_exported(run, tmp_path):
-    small = ps.prune(run, keep="10%")
-    refined = ps.refine(small)
-    assert len(small) == len(refined) == 2014
-    assert all(value.isfinite().all() for value in refined.tensors())
-    ps.save(refined, tmp_path / "fox.ply")
-    assert len(ps.load(tmp_path / "fox.ply")) == 2014
-
-
-@pytest.fixture()
-def no_download(tmp_path, monkeypatch) -> None:
-    """nerfstudio's model downloads AlexNet for LPIPS when it is built, and exporting does not use it."""
-    hub = tmp_path / "torch" / "hub" / "checkpoints"
-    hub.mkdir(parents=True)
-    torch.save(torchvision.models.alexnet().state_dict(), hub / "alexnet-owt-7be5be79.pth")
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-
-
-def test_nerfstudios_exporter_writes_what_is_read(run, tmp_path, monkeypatch, no_download):
-    monkeypatch.chdir(run.parents[3])
-    exporter.ExportGaussianSplat(load_config=run / "config.yml", output_dir=tmp_path).main()
-    theirs, ours = ps.load(tmp_path / "splat.ply"), ps.load(run)
-    # nerfstudio leaves out opacities below 1/255
-    kept = ours[torch.sigmoid(ours.opacities[:, 0]) > 1 / 255]
-    assert len(theirs) == len(kept)
-    for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
-        assert torch.equal(getattr(theirs, name), getattr(kept, name))
-
-
-def test_a_refiner_trains_on_its_undistorted_photos(run):
-    scene = TrainedScene("fox", open_run(run), MemoryCache(0))
-    camera, data = scene.train_frames[0]
-    assert data["image"].shape[2] == 3 and int(camera.width) == data["image"].shape[1]
-    assert len(scene.train_frames) == 45 and len(scene.eval_frames) == 5

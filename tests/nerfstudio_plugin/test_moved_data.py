@@ -9,7 +9,6 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 import pointsplat_ns as ps
-from lab.tables.measure import measure_tables
 from making import run_of, without_data
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import DataError, SceneError
@@ -73,14 +72,6 @@ def test_data_is_not_for_a_scene_without_a_run(moved, tmp_path):
             ps.prune(scene, 100, data=moved)
 
 
-def test_tables_and_viewer_find_the_data_too(runs, moved, tmp_path):
-    run = run_of(runs, "wall-b")
-    with ps.open_viewer(run, port=0, data=moved) as viewer:
-        assert "no dataset" not in viewer.origin
-    found = measure_tables((run,), tmp_path / "t", only=("wall-b/paper/10%",), views=2, side=64, data=moved)
-    assert found.scenes["wall-b"]["origin"] == "held-out photos"
-
-
 def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(runs, trained_walls, tmp_path):
     keep_data_of(runs, "wall-a", trained_walls)
     results = ps.compact_folder(runs, tmp_path / "out", "50%", effort="instant")
@@ -132,16 +123,3 @@ def test_photos_of_other_poses_are_refused_by_data_and_by_photos(runs, moved, tr
     ):
         with pytest.raises(DataError, match=text):
             call()
-    shutil.move(moved, tmp_path / "gone_from_here")
-    config = run / "config.yml"
-    config.write_text(config.read_text().replace(*_parts(config.read_text(), tmp_path / "gone_from_here" / "wall")))
-    with pytest.raises(DataError, match=text):
-        ps.compact(run, "50%", effort="instant", photos=True)
-
-
-def _parts(text: str, place: Path) -> tuple[str, str]:
-    """The lines of a config that name a run's data, and those that name another place."""
-    lines = text.splitlines(keepends=True)
-    first = next(index for index, line in enumerate(lines) if "PosixPath" in line and line.startswith("data:")) + 1
-    last = next(index for index in range(first, len(lines)) if not lines[index].startswith("- "))
-    return "".join(lines[first:last]), "".join(f"- {part}\n" for part in place.parts)

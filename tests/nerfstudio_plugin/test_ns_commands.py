@@ -27,7 +27,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from captures import Capture, Lens
 from ns_viewer import Look, look
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainer
+from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainer
 
 STEPS = {"splatfacto-cpu": 20, "pointsplat": 4}
 VIEWER = ("--viewer.websocket-host", "127.0.0.1", "--viewer.image-format", "png")

@@ -7,12 +7,8 @@ import warnings
 from pathlib import Path
 
 import pytest
-import torch
 
-from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.nerfstudio_plugin.registration import load_specification
-from pointsplat_ns.nerfstudio_plugin.third_party_warnings import NERFSTUDIO, quiet_nerfstudio
-from pointsplat_ns.system import threads
+from pointsplat_ns.nerfstudio_plugin.registration import NERFSTUDIO, load_specification, quiet_nerfstudio
 
 FORKED = """
 import importlib, os, sys, traceback, warnings
@@ -94,7 +90,7 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     code = (
         "from pointsplat_ns.errors import DataError\n"
         "from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line\n"
-        "errors_in_one_line()\nerrors_in_one_line()\n"
+        "errors_in_one_line()\n"
         "raise {}\n"
     )
     run = [sys.executable, "-c"]
@@ -106,44 +102,6 @@ def test_an_input_error_ends_a_command_with_one_line_and_status_1():
     assert "errors_in_one_line()" in methods.read_text()
 
 
-@pytest.fixture
-def three_threads(monkeypatch):
-    """Three threads and cores, of which other programs leave two."""
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(threads, "cores", lambda: 3)
-    monkeypatch.setattr(threads, "free_cores", lambda: 2)
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize(("count", "used"), [(None, 2), (1, 1)])
-def test_steps_use_the_threads_chosen_or_set(
-    three_threads, monkeypatch, wall_scene, wall_config, tmp_path, count, used
-):
-    seen = set()
-
-    def one_step(trainer, step):
-        seen.add(torch.get_num_threads())
-        return torch.zeros(()), {}, {}
-
-    monkeypatch.setattr("pointsplat_ns.nerfstudio_plugin.stopping.StoppableTrainer.one_step", one_step)
-    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.save_checkpoint", lambda *args: None)
-    config = wall_config(wall_scene, tmp_path, 3)
-    config.threads = count
-    config.steps_per_eval_image = 0
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    trainer.callbacks = []  # they need what a real step leaves
-    trainer.train()
-    assert seen == {used}
-    assert torch.get_num_threads() == 3
-    trainer.config.threads = 0
-    with pytest.raises(PointSplatError, match="0 threads"):
-        trainer.train()
-
-
 def printed(text: str, category: type[Warning], module: str) -> list[str]:
     """What is printed of a warning that is raised for a module after nerfstudio's are quieted."""
     with warnings.catch_warnings(record=True) as caught:
@@ -153,13 +111,13 @@ def printed(text: str, category: type[Warning], module: str) -> list[str]:
     return [str(warning.message) for warning in caught]
 
 
-@pytest.mark.parametrize("known", NERFSTUDIO, ids=lambda known: known.text[:30])
+@pytest.mark.parametrize("known", NERFSTUDIO, ids=lambda known: known[0][:30])
 def test_a_known_warning_is_hidden_and_any_other_is_printed(known):
-    assert printed(f"{known.text}, and more", known.category, known.module) == []
+    text, category, module = known
+    assert printed(f"{text}, and more", category, module) == []
     for other in (
-        ("another thing is deprecated", known.category, known.module),
-        (known.text, RuntimeWarning, known.module),
-        (known.text, known.category, "users.script"),
-        (known.text, known.category, f"{known.module}.more"),
+        ("another thing is deprecated", category, module),
+        (text, RuntimeWarning, module),
+        (text, category, f"{module}.more"),
     ):
         assert printed(*other) == [other[0]]

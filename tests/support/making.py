@@ -310,7 +310,7 @@ def parsed_by_ns_train(command: str):
     """The config that ns-train makes of a command line."""
     import tyro
 
-    from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
+    from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
 
     import_nerfstudio()
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion

@@ -18,7 +18,7 @@ from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
+from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 from pointsplat_ns.system.processes import by_first, connect_torchrun, gathered, local_rank, rank, torchrun_rank
 
 REFINER_RATES = {
@@ -53,13 +53,10 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
     """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
-    max_skipped_steps: int = 10
-    """Total number of steps that may be skipped because a loss or a gradient is not finite (a broken photo or scene,
-    rates too high), before training stops and names the scenes. It is a total, not a number of steps in a row: a scene
-    that is broken fails each time its turn comes, and the steps on other scenes in between would reset the count."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
     gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
+    steps_per_eval_batch: Suppress[Fixed[int]] = 0
     prompt: Suppress[Fixed[str | None]] = None
 
     def set_timestamp(self) -> None:
@@ -122,7 +119,6 @@ def pointsplat_config() -> TrainerConfig:
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         max_num_iterations=2000,
         steps_per_save=500,
-        steps_per_eval_batch=0,
         steps_per_eval_image=100,
         steps_per_eval_all_images=0,
         mixed_precision=False,

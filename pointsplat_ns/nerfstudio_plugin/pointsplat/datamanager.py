@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import functools
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -21,9 +19,9 @@ from tyro.conf import Fixed, Suppress
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache, to_device
-from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
+from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
 
@@ -152,12 +150,11 @@ class ScenesDataManager(SpiralSource):
         return self.training_frames(self.shown).dataset._dataparser_outputs
 
     def setup_train(self) -> None:
-        """Nothing to set up: photos are read when they are needed."""
+        """Nothing: photos are read when they are needed."""
 
-    def setup_eval(self) -> None:
-        """Nothing to set up: photos are read when they are needed."""
+    setup_eval = setup_train
 
-    def training_frames(self, scene: int) -> Any:
+    def training_frames(self, scene: int) -> Frames:
         """The training targets of a scene: its photos, or the dense scene's own renders."""
         scene_at = self.scenes[scene]
         return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
@@ -172,33 +169,28 @@ class ScenesDataManager(SpiralSource):
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
         return order[place]
 
-    def _choice(self, step: int) -> tuple[int, list[int]]:
-        """Scene and photos of a step. Photos are drawn at random without repetition within the step."""
-        scene = self.scene_at(step)
-        count = len(self.training_frames(scene))
-        chosen = random.Random(f"{self.config.seed} photos {self.place(step)}")
-        return scene, chosen.sample(range(count), min(self.config.images_per_step, count))
+    def _choice(self, step: int) -> tuple[Frames, list[int]]:
+        """Training targets of a step's scene, and which of them it takes: random ones, none of them twice. Their
+        decoding begins."""
+        targets = self.training_frames(self.scene_at(step))
+        generator = random.Random(f"{self.config.seed} photos {self.place(step)}")
+        chosen = generator.sample(range(len(targets)), min(self.config.images_per_step, len(targets)))
+        targets.prefetch(chosen)
+        return targets, chosen
 
     def start(self, step: int) -> None:
         """Prepare the photos of a step in the background, or the poses of its renders, which are drawn when they are
         needed. An error is raised by :meth:`next_train`."""
-        self.background.start(step, functools.partial(self._ready, step))
+        self.background.start(step, functools.partial(self._choice, step))
 
-    def _ready(self, step: int) -> tuple[int, list[int]]:
-        """Choose scene and photos of a step, and begin to decode them."""
-        scene, photos = self._choice(step)
-        self.training_frames(scene).prefetch(photos)
-        return scene, photos
-
-    def next_train(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+    def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of a training scene, and some of its training photos with their cameras, on this process's device."""
-        scene, photos = self.background.take(step, functools.partial(self._choice, step))
-        targets = self.training_frames(scene)
-        frames = [to_device(targets[i], self.device) for i in photos]
+        targets, chosen = self.background.take(step, functools.partial(self._choice, step))
+        frames = [targets[i] for i in chosen]
         self._pixels = sum(int(camera.height) * int(camera.width) for camera, _ in frames)
-        return scene, frames
+        return self.scene_at(step), frames
 
-    def next_eval(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
+    def next_eval_image(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of an evaluation scene, and one of its held-out photos."""
         scene = self.eval_indices[step % len(self.eval_indices)]
         frames = self.scenes[scene].eval_frames
@@ -207,23 +199,11 @@ class ScenesDataManager(SpiralSource):
                 f"{self.scenes[scene].source}: no frame of its data is held out; change the dataparser's split"
             )
         index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
-        return scene, [to_device(frames[index], self.device)]
-
-    def next_eval_image(self, step: int) -> tuple[int, list[tuple[Cameras, dict[str, Any]]]]:  # type: ignore[override]
-        """As :meth:`next_eval`."""
-        return self.next_eval(step)
-
-    def held_out(self, scene: int) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        """Every held-out photo of a scene with its camera, on this process's device."""
-        return (to_device(frame, self.device) for frame in self.scenes[scene].eval_frames)
+        return scene, [frames[index]]
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the latest step, for nerfstudio's log."""
         return self._pixels
-
-    def get_eval_rays_per_batch(self) -> int:
-        """Pixels of a held-out photo, for nerfstudio's log."""
-        return self.get_train_rays_per_batch() // self.config.images_per_step
 
     def get_datapath(self) -> Path:
         """The path given by ``--data``."""

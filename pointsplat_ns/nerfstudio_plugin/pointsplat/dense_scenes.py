@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -99,7 +98,7 @@ class DenseScene:
         if dense is None:
             dense = self.read_dense()
             if keep:
-                self.cache.put(key, dense, sum(value.nbytes for value in dense.tensors()))
+                self.cache.put(key, dense)
         return dense
 
     def cameras(self, split: Split) -> Cameras:
@@ -119,22 +118,23 @@ class DenseScene:
         return cameras
 
     @cached_property
-    def rendered_train(self) -> RenderedFrames:
-        """Renders of the dense scene from the training poses, in 8 bits as photos are."""
-        return RenderedFrames(RenderedDataset(self, "train"), "uint8", self.cache)
+    def rendered_train(self) -> Frames:
+        """Renders of the dense scene from the training poses, in 8 bits as photos are. None are drawn ahead, which
+        would slow the current step."""
+        return Frames(RenderedDataset(self, "train"), "uint8", self.cache, 0, self._device)
 
     @cached_property
-    def rendered_eval(self) -> RenderedFrames:
+    def rendered_eval(self) -> Frames:
         """Renders of the dense scene from the held-out poses, not rounded."""
-        return RenderedFrames(RenderedDataset(self, "test"), "float32", self.cache)
+        return Frames(RenderedDataset(self, "test"), "float32", self.cache, 0, self._device)
 
     @property
-    def train_frames(self) -> Any:
+    def train_frames(self) -> Frames:
         """Training images: photos if the scene has them, else its own renders."""
         return self.rendered_train
 
     @property
-    def eval_frames(self) -> Any:
+    def eval_frames(self) -> Frames:
         """Held-out images: photos if the scene has them, else its own renders."""
         return self.rendered_eval
 
@@ -202,11 +202,3 @@ class RenderedDataset:
         frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
         _, data = frames[index]  # from the cache
         return {**data, "image": in_unit_range(data["image"])}
-
-
-class RenderedFrames(Frames):
-    """Renders of a dense scene from the cameras of a split, computed when they are needed and kept while the cache has
-    room."""
-
-    def prefetch(self, indices: Iterable[int]) -> None:
-        """Does nothing: rendering ahead would slow the current step."""

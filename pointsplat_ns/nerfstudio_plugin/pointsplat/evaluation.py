@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
@@ -19,6 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table
@@ -30,6 +30,9 @@ METRICS = ("psnr", "ssim", "lpips")
 
 VARIANTS = ("dense", "pruned", "refined")
 
+REFERENCES = {True: "photos", False: "dense renders"}
+"""What renders are compared with, by whether the scene has photos."""
+
 COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "Gaussians", 0),
            ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
 """Columns of the printed table: a value of each variant, the title, digits to show."""
@@ -40,15 +43,24 @@ class SceneReport:
     """Metrics of the variants of one scene, as means over its held-out photos."""
 
     name: str
+    has_photos: bool
+    """Whether renders were compared with photos; otherwise with renders of the dense scene."""
     views: int
     variants: dict[str, dict[str, Any]]
     """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes, fps."""
     per_view: dict[str, dict[str, list[float]]]
     """By variant and metric: one value per photo."""
+    last_picture: Tensor | None
+    """Photo and variants of the last view side by side, (H, W * (1 + variants), 3) in [0, 1]."""
     seen_in_training: bool = True
     seconds: dict[str, float] = field(default_factory=dict)
-    last_picture: Tensor | None = None
-    """Photo and variants of the last view side by side, (H, W * (1 + variants), 3) in [0, 1]."""
+
+    def block(self) -> dict[str, Any]:
+        """The scene in the results of ``ns-eval``."""
+        rows = {name: {k: _finite(v) for k, v in row.items()} for name, row in self.variants.items()}
+        reference = REFERENCES[self.has_photos]
+        about = {"seen_in_training": self.seen_in_training, "views": self.views}
+        return {**about, **rows, "seconds": self.seconds, "reference": reference}
 
 
 @torch.no_grad()
@@ -56,8 +68,7 @@ def evaluate_scene(
     model: PointSplatModel,
     scene: DenseScene,
     variants: dict[str, Gaussians],
-    frames: Iterable[tuple[Cameras, dict]],
-    count: int,
+    frames: Frames | list[Frame],
     lpips: ReportedLpips,
     picture_folder: Path | None = None,
     progress: bool = False,
@@ -68,7 +79,7 @@ def evaluate_scene(
         model: renders the variants; must be in evaluation mode.
         scene: gives the background and the rasterize mode.
         variants: the scene's variants by name, on the model's device.
-        frames, count: cameras of shape (1,) and their photos, and their number, for the progress bar.
+        frames: cameras of shape (1,) and their photos.
         lpips: computes LPIPS. If it fails for one view, the scene has no LPIPS.
         picture_folder: folder for an image of every view; None writes none.
 
@@ -78,21 +89,17 @@ def evaluate_scene(
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
     picture, views = None, 0
-    for camera, data in tracked(frames, f"evaluating {scene.name}", count, progress):
+    for camera, data in tracked(frames, f"evaluating {scene.name}", len(frames), progress):
         pictures: list[Tensor] = []
         for name, gaussians in variants.items():
-            start = _now(model.device)
+            start = now(model.device)
             outputs = model.draw(gaussians, scene, camera)
-            seconds[name].append(_now(model.device) - start)
-            photo = model.photo_of(data, outputs["background"])
-            rgb = outputs["rgb"]
-            pictures = pictures or [photo]
-            pictures.append(rgb)
-            values[name]["psnr"].append(float(psnr(rgb, photo)))
-            values[name]["ssim"].append(float(ssim(rgb, photo)))
-            distance = lpips(rgb, photo)
-            if distance is not None:
-                values[name]["lpips"].append(float(distance))
+            seconds[name].append(now(model.device) - start)
+            photo, rgb = model.photo_of(data, outputs["background"]), outputs["rgb"]
+            pictures = [*(pictures or [photo]), rgb]
+            for metric, measure in (("psnr", psnr), ("ssim", ssim), ("lpips", lpips)):
+                value = measure(rgb, photo)
+                values[name][metric] += [] if value is None else [float(value)]
         picture = torch.cat(pictures, dim=1)
         if picture_folder is not None:
             write_picture(picture, picture_folder / f"{scene.name}_{views:04d}.png")
@@ -105,59 +112,42 @@ def evaluate_scene(
     if any(len(per_view["lpips"]) < views for per_view in values.values()):
         for per_view in values.values():  # a mean over fewer views would not be comparable
             per_view["lpips"] = []
-    rows = {}
-    for name, gaussians in variants.items():
-        rows[name] = {metric: _mean(values[name][metric]) for metric in METRICS}
-        rows[name] |= {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
-        rows[name]["fps"] = 1.0 / statistics.median(seconds[name])
-    return SceneReport(scene.name, views, rows, values, last_picture=picture)
+    rows = {
+        name: {metric: _mean(values[name][metric]) for metric in METRICS}
+        | {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
+        | {"fps": 1.0 / statistics.median(seconds[name])}
+        for name, gaussians in variants.items()
+    }
+    return SceneReport(scene.name, scene.has_photos, views, rows, values, picture)
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed."""
+    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed, and with
+    separate means for scenes compared with photos and for scenes compared with renders of the dense scene."""
+    parts = []
+    for photos in (True, False):
+        some = [report for report in reports if report.has_photos == photos]
+        if some:
+            parts.append({**_means(some, with_std), "reference": REFERENCES[photos]})
+    summary = {**parts[0], "scenes": {report.name: report.block() for report in reports}}
+    return summary if len(parts) == 1 else {**summary, "against_dense_renders": parts[1]}
+
+
+def _means(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
+    """Means over scenes that are compared with the same kind of reference."""
     unseen = [r for r in reports if not r.seen_in_training]
     seen = [r for r in reports if r.seen_in_training]
     judged = unseen or reports
-    summary: dict[str, Any] = {}
+    means: dict[str, Any] = {}
     for metric in METRICS:
-        summary[metric] = _mean([r.variants["refined"][metric] for r in judged])
+        means[metric] = _mean([r.variants["refined"][metric] for r in judged])
         if with_std:
             per_view = [value for r in judged for value in r.per_view["refined"][metric]]
-            summary[f"{metric}_std"] = _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
-    summary["average"] = _average(reports)
+            means[f"{metric}_std"] = _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
+    means["average"] = _average(reports)
     if unseen and seen:
-        summary["average_unseen"], summary["average_seen"] = _average(unseen), _average(seen)
-    summary["scenes"] = {
-        r.name: {
-            "seen_in_training": r.seen_in_training,
-            "views": r.views,
-            **{name: {k: _finite(v) for k, v in row.items()} for name, row in r.variants.items()},
-            "seconds": r.seconds,
-        }
-        for r in reports
-    }
-    return summary
-
-
-def summarize_by_reference(reports: list[SceneReport], has_photos: list[bool], with_std: bool) -> dict[str, Any]:
-    """As :func:`summarize`, with separate means for scenes compared with photos (``has_photos``, one for each report)
-    and scenes compared with renders of the dense scene."""
-    names = {True: "photos", False: "dense renders"}
-    parts = {
-        photos: summarize([r for r, kind in zip(reports, has_photos, strict=True) if kind == photos], with_std)
-        for photos in sorted(set(has_photos), reverse=True)
-    }
-    for photos, part in parts.items():
-        part["reference"] = names[photos]
-        for row in part["scenes"].values():
-            row["reference"] = names[photos]
-    summary = next(iter(parts.values()))
-    if len(parts) == 2:
-        other = parts[False]
-        rows = {**summary["scenes"], **other.pop("scenes")}
-        summary["scenes"] = {r.name: rows[r.name] for r in reports}
-        summary["against_dense_renders"] = other
-    return summary
+        means["average_unseen"], means["average_seen"] = _average(unseen), _average(seen)
+    return means
 
 
 def print_summary(summary: dict[str, Any]) -> None:
@@ -175,21 +165,23 @@ def print_summary(summary: dict[str, Any]) -> None:
             means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
             blocks += [("average", seen, part[key]) for seen, key in means if key in part]
         rows = [
-            (*((name, seen) if variant == VARIANTS[0] else ("", "")), variant, *_cells(scene[variant]))
+            (
+                *((name, seen) if variant == VARIANTS[0] else ("", "")),
+                variant,
+                *(
+                    "-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}"
+                    for key, _, digits in COLUMNS
+                ),
+            )
             for name, seen, scene in blocks
             for variant in VARIANTS
         ]
         header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
-        reference = {"photos": "held-out photos", "dense renders": "the dense scenes' own renders"}[part["reference"]]
+        reference = "held-out photos" if part["reference"] == REFERENCES[True] else "the dense scenes' own renders"
         title = f"{made}; compared with {reference}"
         print_table(header, rows, title=title, left=(0, 1, 2), section=len(VARIANTS))
     if "lpips_note" in summary:
         print(f"no LPIPS: {summary['lpips_note']}")
-
-
-def _cells(values: dict[str, Any]) -> list[str]:
-    """The columns of a variant; a dash for what was not computed."""
-    return ["-" if values[name] is None else f"{values[name]:,.{digits}f}" for name, _, digits in COLUMNS]
 
 
 def only_finite(values: dict[str, Any]) -> dict[str, float]:
@@ -215,7 +207,8 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _now(device: torch.device) -> float:
+def now(device: torch.device) -> float:
+    """Seconds since any moment, once the device has done its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -7,9 +7,9 @@ viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network i
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -17,6 +17,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
@@ -24,17 +25,24 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.metrics import psnr
-from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of, need_pinhole
-from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
+from pointsplat_ns.metrics import ImageError, psnr
+from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
+from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PhotoLoss
-from pointsplat_ns.nerfstudio_plugin.pointsplat.pruned_scenes import PrunedScene, PrunedScenes
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import PrunedScene, PrunedScenes
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.augmentation import random_transform
+
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
+
+PIXEL_LOSSES: dict[str, Callable[[Tensor], Tensor]] = {
+    "l1": lambda difference: difference.abs().mean(),
+    # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
+    "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
+}
+"""Pixel losses by name, as functions of the difference (H, W, 3) of two images."""
 
 
 @dataclass
@@ -109,7 +117,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
 
 
 class PointSplatModel(SplatfactoModel):
-    """The model described in the module's docstring. The pipeline passes in the scenes by :meth:`attach`."""
+    """The model described in the module's docstring. The scenes are those of the ``datamanager`` that it is given."""
 
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
@@ -119,20 +127,12 @@ class PointSplatModel(SplatfactoModel):
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
         self.crop_box: OrientedBox | None = None
-        self.scenes: list[DenseScene] = []
-        self.shown = 0
-        """Index of the scene that the viewer and the exporter get."""
-        self.loss = PhotoLoss(self.config.pixel_loss, self.config.lpips_weight, self.config.lpips_net)
-        self._pruned = self._pruned_within(MemoryCache(0), Background())
+        manager: ScenesDataManager = self.kwargs["datamanager"]
+        self.scenes, self.shown = manager.scenes, manager.shown
+        self._pruned = PrunedScenes(manager.cache, self.refiner.prepare, manager.background)
+        self.no_lpips_reason: str | None = None
+        """Why LPIPS is left out of the loss; None while it is part of it."""
         self._refined: tuple[int, Gaussians] | None = None
-
-    def attach(self, scenes: list[DenseScene], shown: int, cache: MemoryCache, background: Background) -> None:
-        """Set the scenes, the index of the one that the viewer and the exporter get, the cache for pruned scenes, and
-        what prunes them ahead."""
-        self.scenes, self.shown, self._pruned = scenes, shown, self._pruned_within(cache, background)
-
-    def _pruned_within(self, cache: MemoryCache, background: Background) -> PrunedScenes:
-        return PrunedScenes(cache, self.refiner.prepare, background)
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
         """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the
@@ -180,21 +180,10 @@ class PointSplatModel(SplatfactoModel):
                 self._refined = index, self.refiner(scene.pruned, scene.structure)
         return self._refined[1]
 
-    def _drawn_keep(self, generator: torch.Generator | None = None) -> float | None:
-        """The budget of a training step, its first random number if there are several; None is the config's
-        ``keep``."""
+    def _drawn_keep(self, generator: torch.Generator | None = None) -> float:
+        """The budget of a training step, its first random number if there are several."""
         keeps = (self.config.keep, *self.config.more_keeps)
-        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu"))] if len(keeps) > 1 else None
-
-    def timed_refine(self, index: int) -> tuple[Gaussians, float]:
-        """As :meth:`refine` in evaluation, but not from the cache, and the seconds that it took."""
-        self.pruned_scene(index)
-        self._refined = None
-        start = time.perf_counter()
-        refined = self.refine(index)
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return refined, time.perf_counter() - start
+        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu")) if len(keeps) > 1 else 0]
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
         """Render Gaussians with a scene's background and rasterize mode, from a camera of shape (1,), all on the
@@ -216,8 +205,7 @@ class PointSplatModel(SplatfactoModel):
             Ks=camera.get_intrinsics_matrices(),
             width=width,
             height=height,
-            near_plane=near_plane_of(camera),
-            eps2d=eps2d_of(camera),
+            **carried(camera),
             sh_degree=gaussians.sh_degree,
             render_mode="RGB" if self.training else "RGB+ED",
             rasterize_mode="antialiased" if gaussians.antialiased else scene.rasterize_mode,
@@ -259,6 +247,25 @@ class PointSplatModel(SplatfactoModel):
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
         quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
         return outputs, self.loss(pairs), {"psnr": quality, "gaussian_count": len(refined)}
+
+    def loss(self, pairs: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+        """The terms of the loss by name, as means over pairs of renders and photos, each (H, W, 3) in [0, 1]: the pixel
+        loss, and the weighted ``lpips``. Once LPIPS could not be computed it stays left out, so that the loss does not
+        change back during training."""
+        config = self.config
+        pixel_loss = PIXEL_LOSSES[config.pixel_loss]
+        losses: dict[str, Tensor] = {}
+        losses[config.pixel_loss] = torch.stack([pixel_loss(render - photo) for render, photo in pairs]).mean()
+        if config.lpips_weight > 0 and self.no_lpips_reason is None:
+            cheap: Literal["alex", "vgg"] = "vgg" if self.device.type == "cuda" else "alex"
+            net = cheap if config.lpips_net == "auto" else config.lpips_net
+            try:
+                lpips = cached_lpips(net, pairs[0][0].device)
+                losses["lpips"] = config.lpips_weight * torch.stack([lpips(*pair) for pair in pairs]).mean()
+            except (LpipsUnavailable, ImageError) as error:  # no weights, or a picture too small for the network
+                self.no_lpips_reason = str(error)
+                CONSOLE.log(f"going on without LPIPS in the loss: {error}")
+        return losses
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
         """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha channel."""

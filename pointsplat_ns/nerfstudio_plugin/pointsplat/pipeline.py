@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.distributed as dist
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
-from pointsplat_ns.nerfstudio_plugin.pointsplat import distributed
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     SceneReport,
     evaluate_scene,
+    now,
     only_finite,
     print_summary,
-    summarize_by_reference,
+    summarize,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.losses import PIXEL_LOSSES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES, PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
@@ -52,18 +53,6 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: PointSplatPipeline)
     datamanager: ScenesDataManagerConfig = field(default_factory=ScenesDataManagerConfig)
     model: PointSplatModelConfig = field(default_factory=PointSplatModelConfig)
-
-
-@dataclass
-class TrainingState:
-    """The state of a training that checkpoints hold beside weights and optimisers."""
-
-    trained_on: set[str]
-    """Identities of the scenes that the network has been trained on, also before it was resumed."""
-    seconds: float = 0.0
-    """Duration of the training so far, also before it was resumed."""
-    skipped: Counter[str] = field(default_factory=Counter)
-    """Number of steps skipped because a loss or a gradient was not finite, by scene, over all processes."""
 
 
 class PointSplatPipeline(VanillaPipeline):
@@ -100,30 +89,26 @@ class PointSplatPipeline(VanillaPipeline):
             device=device, test_mode=test_mode, world_size=world_size, local_rank=processes.rank()
         )
         torch.manual_seed(config.datamanager.seed)
-        self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler)
+        self._model = config.model.setup(
+            scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler, datamanager=self.datamanager
+        )
         self.model.to(device)
-        manager = self.datamanager
-        self.model.attach(manager.scenes, manager.shown, manager.cache, manager.background)
         processes.share_state(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
-        trained_on = [scenes[i].identity for i in indices] if test_mode == "val" else []
-        self.training_state = TrainingState(set(trained_on))
-        """State of the training that checkpoints hold beside weights and optimisers."""
+        self.trained_on = {scenes[i].identity for i in indices} if test_mode == "val" else set()
+        """Identities of the scenes that the network has been trained on, also before it was resumed."""
+        self.seconds = 0.0
+        """Duration of the training so far, also before it was resumed."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The training state, for torch's ``state_dict``."""
-        state = self.training_state
-        return {"trained_on": sorted(state.trained_on), "skipped": dict(state.skipped), "seconds": state.seconds}
+        """The state of the training that checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""
+        return {"trained_on": sorted(self.trained_on), "seconds": self.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Load the training state of a checkpoint; logs which of its scenes are missing now. The counts of skipped
-        steps of these are dropped."""
-        scenes, ours = self.datamanager.scenes, self.training_state
-        there = {scene.name for scene in scenes}
-        ours.seconds = state.get("seconds", 0.0)
-        ours.skipped = Counter({name: count for name, count in state["skipped"].items() if name in there})
-        ours.trained_on |= set(state["trained_on"])
-        gone = set(state["trained_on"]) - {scene.identity for scene in scenes}
+        """Load the state of a checkpoint; logs which of its scenes are missing now."""
+        self.seconds = state.get("seconds", 0.0)
+        self.trained_on |= set(state["trained_on"])
+        gone = set(state["trained_on"]) - {scene.identity for scene in self.datamanager.scenes}
         if gone:
             CONSOLE.log(f"trained on {', '.join(sorted(gone))}, which {self.datamanager.get_datapath()} no longer has")
 
@@ -140,20 +125,17 @@ class PointSplatPipeline(VanillaPipeline):
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
         been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
-        over processes; the gradients are each process's own. The metric ``faults`` is a list of texts, one for each
-        loss of this process that is not finite.
+        over processes; the gradients are each process's own, and so are the ``own_losses`` among the metrics.
         """
         for later in range(step, step + 1 + LOOK_AHEAD):
             self._start(later)
         torch.manual_seed(self._seed(step))
         index, frames = self.datamanager.next_train(step)
-        outputs, losses, metrics = self.model.losses(index, frames)
-        faults = [f"the {name} loss is {v.item()}" for name, v in losses.items() if not v.isfinite()]
-        means = distributed.means_over_ranks({**losses, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
-        if self.world_size > 1:
-            losses = {name: distributed.with_value(value, means[name]) for name, value in losses.items()}
-        metrics |= {"psnr": means["psnr"], "scene": index, "faults": faults}
-        return outputs, losses, metrics
+        outputs, own, metrics = self.model.losses(index, frames)
+        means = means_over_ranks({**own, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
+        # the values of the means, with the gradients of this process's own
+        losses = own if self.world_size == 1 else {n: v + (means[n] - v).detach() for n, v in own.items()}
+        return outputs, losses, metrics | {"psnr": means["psnr"], "scene": index, "own_losses": own}
 
     def _seed(self, step: int) -> int:
         """Seed of the random numbers of a step."""
@@ -166,16 +148,6 @@ class PointSplatPipeline(VanillaPipeline):
         self.model.start(self.datamanager.scene_at(step), torch.Generator("cpu").manual_seed(self._seed(step)))
 
     @torch.no_grad()
-    def get_eval_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
-        """Losses at one held-out photo."""
-        training = self.training
-        self.eval()
-        index, frames = self.datamanager.next_eval(step)
-        result = self.model.losses(index, frames)
-        self.train(training)
-        return result
-
-    @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
         """Metrics at one held-out photo, and an image of photo, pruned and refined side by side."""
         training = self.training
@@ -183,7 +155,7 @@ class PointSplatPipeline(VanillaPipeline):
         index, frames = self.datamanager.next_eval_image(step)
         variants = {"pruned": self.model.pruned_scene(index).pruned, "refined": self.model.refine(index)}
         scene = self.datamanager.scenes[index]
-        report = evaluate_scene(self.model, scene, variants, frames, 1, ReportedLpips())
+        report = evaluate_scene(self.model, scene, variants, frames, ReportedLpips())
         pixels = int(frames[0][0].height) * int(frames[0][0].width)
         metrics: dict[str, Any] = {"num_rays": pixels}
         for variant, values in report.variants.items():
@@ -218,24 +190,22 @@ class PointSplatPipeline(VanillaPipeline):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
             smaller = model.pruned_scene(index, dense)
-            refined, seconds = model.timed_refine(index)
+            start = now(model.device)
+            refined = model.refiner(smaller.pruned, smaller.structure)
+            seconds = now(model.device) - start
             variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
-            frames, count = manager.held_out(index), len(scene.eval_frames)
-            report = evaluate_scene(model, scene, variants, frames, count, lpips, output_path, progress=True)
-            report.seen_in_training = scene.identity in self.training_state.trained_on
+            report = evaluate_scene(model, scene, variants, scene.eval_frames, lpips, output_path, progress=True)
+            report.seen_in_training = scene.identity in self.trained_on
             report.seconds = {"prune": smaller.seconds, "refine": seconds}
             report.last_picture = None
             reports.append(report)
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
         reports = sorted(processes.gathered(reports), key=lambda report: order[report.name])
-        summary = summarize_by_reference(reports, [scene.has_photos for scene in manager.scenes], get_std)
+        summary = summarize(reports, get_std)
         config = self.config.model
-        summary["settings"] = {
-            "size": config.size,
-            **config.network_options(),
-            **dataclasses.asdict(config.prune_settings()),
-        }
+        pruning = dataclasses.asdict(config.prune_settings())
+        summary["settings"] = {"size": config.size, **config.network_options(), **pruning}
         summary["supervision"] = manager.supervision
         if lpips.reason is not None:
             summary["lpips_note"] = lpips.reason
@@ -265,3 +235,19 @@ class PointSplatPipeline(VanillaPipeline):
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]
+
+
+def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    """Mean of each named scalar over the processes that have it, without gradient, for the names that this process has.
+    ``names`` are the same in every process; ``values`` are this process's, on its device."""
+    present = [name for name in names if name in values]
+    if processes.world_size() == 1:
+        return {name: values[name].detach() for name in present}
+    device = next(iter(values.values())).device
+    table = torch.zeros(2, len(names), dtype=torch.float64, device=device)  # sums and counts
+    for column, name in enumerate(names):
+        if name in values:
+            table[0, column], table[1, column] = values[name].detach().double(), 1.0
+    dist.all_reduce(table)
+    means = dict(zip(names, table[0] / table[1], strict=True))
+    return {name: means[name].to(values[name].dtype) for name in present}

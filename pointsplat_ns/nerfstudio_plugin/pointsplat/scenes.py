@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -24,11 +26,10 @@ from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
-from pointsplat_ns.io.splatfacto import read_checkpoint
-from pointsplat_ns.nerfstudio_plugin.corrected_poses import corrected_poses, need_photos_as_rendered
+from pointsplat_ns.io.splatfacto import read_checkpoint, read_photo_fit
+from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
@@ -64,6 +65,55 @@ def dataparser_of(run: Run) -> DataParser:
         setattr(config, field_name, False if field_name in ("load_seed_points", "load_3D_points") else value)
     config.data = run.data
     return config.setup()
+
+
+def corrected_poses(run: Run, poses: Tensor) -> Tensor:
+    """Poses of a run's training photos with the corrections in its checkpoint, as nerfstudio's model applies them.
+
+    Args:
+        run: a Splatfacto run.
+        poses: (C, 3, 4) camera to world, OpenGL axes, in the order of the training split.
+
+    Returns:
+        (C, 3, 4); ``poses`` itself if the training corrected none.
+
+    Raises:
+        SceneError: if the checkpoint is not usable, or the run does not say how it corrects poses.
+        DataError: if the dataset has another number of training photos than were corrected.
+    """
+    adjustments = read_photo_fit(run.checkpoint).adjustments
+    if adjustments is None:
+        return poses
+    if len(adjustments) != len(poses):
+        raise DataError(
+            f"{run.data}: {len(poses)} training photos, but {run.checkpoint} corrects the poses of "
+            f"{len(adjustments)}; put back the data as it was"
+        )
+    fields = (settings.get("camera_optimizer") for settings in (run.model_fields, run.datamanager_fields))
+    modes = [field.fields.get("mode") for field in fields if isinstance(field, Tagged)]
+    mode = next((mode for mode in modes if mode in ("SO3xR3", "SE3")), None)
+    if mode is None:
+        raise SceneError(
+            f"{run.config_path}: its camera optimizer has the mode {next(iter(modes), None)!r}, but {run.checkpoint} "
+            "holds corrected poses; expected SO3xR3 or SE3; put back the config.yml of the run"
+        )
+    optimizer: CameraOptimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=len(poses), device="cpu")
+    optimizer.pose_adjustment.data = adjustments
+    with torch.no_grad():
+        motions = optimizer.get_correction_matrices().to(poses)
+    # Rotations are about the camera's own position, translations in world axes.
+    return torch.cat([motions[:, :, :3] @ poses[:, :, :3], poses[:, :, 3:] + motions[:, :, 3:]], dim=2)
+
+
+def need_photos_as_rendered(run: Run, instead: str) -> None:
+    """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of its photos: a bilateral
+    grid, or an embedding of appearance. Renders of the scene then do not have the colours of the photos."""
+    colors = read_photo_fit(run.checkpoint).colors
+    if colors:
+        raise DataError(
+            f"{run.checkpoint}: holds {colors}, which fits colours to each training photo; renders of the scene do not "
+            f"have them, so its training photos cannot be used; {instead}"
+        )
 
 
 class TrainedScene(DenseScene):
@@ -103,7 +153,7 @@ class TrainedScene(DenseScene):
         return self.run.rasterize_mode
 
     @property
-    def background(self) -> torch.Tensor:
+    def background(self) -> Tensor:
         """Background colour (3,), in [0, 1], that the run is evaluated with."""
         color = self.run.model_fields.get("background_color")
         return get_color(color) if color in ("black", "white") else torch.tensor(VIEWER_BACKGROUND, **FLOATS)
@@ -142,7 +192,7 @@ class TrainedScene(DenseScene):
         dataset = UndistortedDataset(self._outputs(split), scale)
         if split == "train":
             dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
-        return Frames(dataset, cache=self.cache)
+        return Frames(dataset, cache=self.cache, device=self._device)
 
     @cached_property
     def train_frames(self) -> Any:
@@ -207,11 +257,10 @@ def training_scenes(
                 missing.append(f"{run.config_path}: its data {run.data} is not there")
                 what = "left out" if chosen == "photos" else "seen from sampled poses"
                 CONSOLE.log(f"{name} is {what}: {missing[-1]}")
-            if chosen == "photos":
-                if not has_photos:
-                    continue
+            if has_photos and chosen == "photos":
                 need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
-        scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
+        if has_photos or chosen == "dense":
+            scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
     scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
     if not scenes:
         others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""

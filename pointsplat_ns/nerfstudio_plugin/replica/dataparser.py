@@ -52,19 +52,14 @@ class ReplicaDataParser(DataParser):
     """Reads a scene of the Replica layout; no orientation, centring or automatic scaling is applied."""
 
     config: ReplicaDataParserConfig
-
-    def __init__(self, config: ReplicaDataParserConfig):
-        super().__init__(config)
-        self._scene: ReplicaScene | None = None
+    _scene: ReplicaScene | None = None
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         """See the base class. ``split`` is "train", or "val" or "test", which are the same held-out frames. Raises
         DataError if the folder or the configuration cannot be used."""
         config = self.config
         self._check_config()
-        if self._scene is None:  # once for both splits
-            self._scene = load_replica(config.data)
-        scene = self._scene
+        self._scene = scene = self._scene or load_replica(config.data)  # once for both splits
         if config.depth_unit_scale_factor is not None:
             scene = replace(scene, params=replace(scene.params, scale=1.0 / config.depth_unit_scale_factor))
         train, held_out = self._split(scene)
@@ -75,15 +70,9 @@ class ReplicaDataParser(DataParser):
         camera_to_worlds = flip_camera_axes(torch.from_numpy(part.poses))[:, :3]  # OpenCV to nerfstudio's OpenGL
         camera_to_worlds[:, :, 3] *= config.scale_factor
         cameras = Cameras(
-            camera_to_worlds=camera_to_worlds.float(),
-            fx=params.fx,
-            fy=params.fy,
-            cx=cx,
-            cy=cy,
-            width=params.width,
-            height=params.height,
+            camera_to_worlds.float(), params.fx, params.fy, cx, cy, params.width, params.height,
             camera_type=CameraType.PERSPECTIVE,
-        )
+        )  # fmt: skip
         metadata: dict = {}
         if part.depths is not None:
             metadata["depth_filenames"] = list(part.depths)
@@ -99,15 +88,18 @@ class ReplicaDataParser(DataParser):
         )
 
     def _check_config(self) -> None:
-        config = self.config
-        for name, least in (("frame_stride", 1), ("eval_every", 2), ("num_seed_points", 1)):
-            if getattr(config, name) < least:
-                flag = name.replace("_", "-")
-                raise DataError(f"--{flag} {getattr(config, name)}: expected a whole number of at least {least}")
-        for name in ("scale_factor", "depth_unit_scale_factor"):
-            value = getattr(config, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise DataError(f"--{name.replace('_', '-')} {value}: expected a positive number")
+        least = {
+            "frame_stride": 1,
+            "eval_every": 2,
+            "num_seed_points": 1,
+            "scale_factor": 0,
+            "depth_unit_scale_factor": 0,
+        }
+        for name, bound in least.items():
+            value = getattr(self.config, name)
+            if value is not None and not (bound <= value < np.inf and value > 0):  # NaN fails too
+                wanted = f"a number of at least {bound}" if bound else "a positive number"
+                raise DataError(f"--{name.replace('_', '-')} {value}: expected {wanted}")
 
     def _split(self, scene: ReplicaScene) -> tuple[list[int], list[int]]:
         """Positions of the training and of the held-out frames in ``scene``."""
@@ -160,20 +152,16 @@ def fuse_depth(
     num_points: int,
     principal_point: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unproject the depth images of training frames and thin them to at most ``num_points`` points: xyz float32 (P, 3)
-    in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
+    """Unproject the depth images of a scene that has them and thin them to at most ``num_points`` points: xyz float32
+    (P, 3) in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
 
     At most 200 frames are read, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. At
     most ``40 * num_points`` pixels are kept in total, several for most voxels, so that time and memory do not grow with
     the length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxels are as small as
-    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5. Raises DataError if the
-    scene has no depth images.
+    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5.
     """
-    depths = scene.depths
-    if depths is None:
-        raise DataError(f"{scene.folder}: no depth images; expected one for every photo")
+    depths, params = scene.depths or (), scene.params
     chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 200)).round().astype(int))
-    params = scene.params
     budget = max(num_points * 40 // len(chosen), 1)
     step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
     all_xyz, all_rgb = [], []
@@ -187,14 +175,8 @@ def fuse_depth(
         v, u = np.mgrid[offset // step : params.height : step, offset % step : params.width : step]
         v, u = v[valid[v, u]], u[valid[v, u]]
         z = depth[v, u].astype(np.float64)
-        camera = np.stack(
-            [
-                (u + 0.5 - principal_point[0]) / params.fx * z,
-                (v + 0.5 - principal_point[1]) / params.fy * z,
-                z,
-            ],
-            axis=-1,
-        )
+        cx, cy = principal_point
+        camera = np.stack([(u + 0.5 - cx) / params.fx * z, (v + 0.5 - cy) / params.fy * z, z], axis=-1)
         pose = scene.poses[index]
         all_xyz.append((camera @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
         all_rgb.append(read_photo(scene.photos[index], params)[v, u])
@@ -238,14 +220,11 @@ def _inner(depth: np.ndarray, edge: float = 0.05) -> np.ndarray:
     """bool (H, W): depth is measured here and in the four neighbours, and differs from theirs by a share of at most
     ``edge``. Others are taken to lie on an outline, where sensors and resampling produce points between two surfaces:
     on a plane, depth changes this much from one pixel to the next only at grazing angles (over 85 degrees)."""
-    measured = depth > 0
-    inner = measured.copy()
+    inner = depth > 0
     for axis in (0, 1):
-        before = [slice(None), slice(None)]
-        after = [slice(None), slice(None)]
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        a, b = depth[tuple(before)], depth[tuple(after)]
+        along, kept = np.moveaxis(depth, axis, 0), np.moveaxis(inner, axis, 0)
+        a, b = along[:-1], along[1:]
         joined = (a > 0) & (b > 0) & (np.abs(a - b) <= edge * np.minimum(a, b))
-        inner[tuple(before)] &= joined
-        inner[tuple(after)] &= joined
+        kept[:-1] &= joined
+        kept[1:] &= joined
     return inner

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from PIL import Image
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import one_line, read_text
@@ -34,17 +35,17 @@ FARTHEST = 1e18
 
 @dataclass(frozen=True)
 class FileNames:
-    """Names of the files in a scene folder."""
+    """Names of the files in a scene folder; the first group of a pattern is the number of a frame."""
 
     trajectory: str
     photos: str
     """Folder of the photos."""
     photo: str
-    """Pattern of a photo's name, with its number as the first group."""
+    """Pattern of a photo's name."""
     depths: str
     """Folder of the depth images."""
     depth: str
-    """Pattern of a depth image's name, likewise."""
+    """Pattern of a depth image's name."""
     example: str
     """A photo's path."""
 
@@ -55,14 +56,6 @@ NICE_SLAM = FileNames(
 SEMANTIC_NERF = FileNames(
     "traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png", "rgb/rgb_0.png"
 )
-
-
-def file_names(folder: Path) -> FileNames | None:
-    """The layout of a scene folder, by its trajectory or photos; None if it is none."""
-    for names in (NICE_SLAM, SEMANTIC_NERF):
-        if (folder / names.trajectory).is_file():
-            return names
-    return NICE_SLAM if (folder / NICE_SLAM.photos).is_dir() else None
 
 
 @dataclass(frozen=True)
@@ -141,21 +134,17 @@ def load_replica(folder: Path) -> ReplicaScene:
     """
     folder = Path(folder)
     hint = "a scene folder holds traj.txt and results/frame*.jpg, or traj_w_c.txt and rgb/rgb_*.png"
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; {hint}")
-    names = file_names(folder)
+    layouts = (NICE_SLAM, SEMANTIC_NERF)
+    names = next((each for each in layouts if (folder / each.trajectory).is_file()), None)
     if names is None:
-        scenes = sorted(
-            {p.parent.name for each in (NICE_SLAM, SEMANTIC_NERF) for p in folder.glob(f"*/{each.trajectory}")}
-        )
+        scenes = sorted({path.parent.name for each in layouts for path in folder.glob(f"*/{each.trajectory}")})
         hint = f"it contains the scenes {', '.join(scenes)}: name one of them" if scenes else hint
-        raise DataError(f"{folder}: not a scene of the Replica layout; {hint}")
+        raise DataError(f"{folder}: no {' or '.join(each.trajectory for each in layouts)}; {hint}")
     trajectory = folder / names.trajectory
     photos, depths = _numbered(folder / names.photos, names.photo), _numbered(folder / names.depths, names.depth)
     if not photos:
         raise DataError(f"{folder / names.photos}: no photo found; expected {names.example} and so on")
     numbers = sorted(photos)
-    params = _params(folder, names, photos[numbers[0]])
     poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
         missing = [n for n in range(numbers[0], numbers[0] + len(poses)) if n not in photos]
@@ -171,15 +160,15 @@ def load_replica(folder: Path) -> ReplicaScene:
         )
     finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
     keep, lost = np.flatnonzero(finite).tolist(), (np.flatnonzero(~finite) + 1).tolist()
-    if not keep:
-        raise DataError(f"{trajectory}: none of the {len(poses)} poses is finite; expected numbers below {FARTHEST:g}")
     if lost:
         some = ", ".join(map(str, lost[:5])) + (" and more" if lost[5:] else "")
-        what = f"{len(lost)} of {len(poses)} poses hold NaN, Inf or numbers beyond {FARTHEST:g}"
-        logger.warning("%s: %s (line %s): their frames are left out", trajectory, what, some)
+        what = f"{trajectory}: {len(lost)} of {len(poses)} poses hold NaN, Inf or numbers beyond {FARTHEST:g}"
+        if not keep:
+            raise DataError(f"{what}; expected one that does not")
+        logger.warning("%s (line %s): their frames are left out", what, some)
     return ReplicaScene(
         folder=folder,
-        params=params,
+        params=_params(folder, names, photos[numbers[0]]),
         numbers=tuple(numbers[i] for i in keep),
         photos=tuple(photos[numbers[i]] for i in keep),
         depths=tuple(depths[numbers[i]] for i in keep) if depths else None,
@@ -191,7 +180,7 @@ def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
     """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it, or those that all sequences
     of Semantic-NeRF have. Raises DataError if there are none, or a number is missing or out of range."""
     places = folder / "cam_params.json", folder.absolute().parent / "cam_params.json"
-    wanted = 'expected {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}'
+    wanted = 'expected {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with positive numbers'
     path = next((place for place in places if place.is_file()), None)
     if path is None and names is SEMANTIC_NERF:
         width, height = _opened(photo).size
@@ -201,36 +190,33 @@ def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
     try:
         camera = json.loads(read_text(path))["camera"]
         w, h, fx, fy, cx, cy, scale = (float(camera[key]) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+        positive = all(0 < value < FARTHEST for value in (w, h, fx, fy, scale)) and abs(cx) + abs(cy) < FARTHEST
+        if not positive or w % 1 or h % 1:  # NaN fails too
+            raise ValueError(f"{camera!s:.200}")
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path}: {type(error).__name__}: {one_line(error)}; {wanted}") from None
-    positive = all(0 < value < FARTHEST for value in (w, h, fx, fy, scale)) and abs(cx) + abs(cy) < FARTHEST
-    if not positive or w % 1 or h % 1:  # NaN fails too
-        raise DataError(f"{path}: {camera!s:.200}; {wanted} with positive numbers, whole ones of pixels")
+        raise DataError(f"{path}: {type(error).__name__}: {one_line(error)}; {wanted}, whole ones of pixels") from None
     return PinholeParams(int(w), int(h), fx, fy, cx, cy, scale, path)
 
 
 def read_trajectory(path: Path) -> np.ndarray:
     """The poses of a ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite. Blank
-    lines are ignored. Raises DataError if the file is missing, or a line is not 16 numbers."""
+    lines are ignored. Raises DataError if the file cannot be read, or a line is not 16 numbers."""
+    wanted = "expected one camera-to-world per line (16 numbers, a 4 x 4 matrix, row by row)"
     try:
-        text = read_text(path, 1 << 28)
-    except FileNotFoundError:
-        raise DataError(f"{path}: not found; expected one camera-to-world (16 numbers) per line") from None
-    except (OSError, ValueError):
-        raise DataError(f"{path}: not a text file; expected one camera-to-world (16 numbers) per line") from None
+        lines = read_text(path, 1 << 28).splitlines()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: {one_line(error)}; {wanted}") from None
     rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         words = line.replace(",", " ").split()
-        if not words:
-            continue
-        if len(words) != 16:
-            raise DataError(f"{path}: line {number} has {len(words)} values; expected 16 (a 4 x 4 matrix, row by row)")
         try:
-            rows.append([float(word) for word in words])
+            if len(words) not in (0, 16):
+                raise ValueError(f"{len(words)} values")
+            rows += [[float(word) for word in words]] if words else []
         except ValueError as error:
-            raise DataError(f"{path}: line {number}: {error}; expected 16 numbers") from None
+            raise DataError(f"{path}: line {number}: {error}; {wanted}") from None
     if not rows:
-        raise DataError(f"{path}: empty; expected one camera-to-world (16 numbers) per line")
+        raise DataError(f"{path}: empty; {wanted}")
     return np.asarray(rows, dtype=np.float64).reshape(-1, 4, 4)
 
 
@@ -253,8 +239,6 @@ def read_depth(path: Path, params: PinholeParams) -> np.ndarray:
 
 
 def _opened(path: Path) -> Any:
-    from PIL import Image
-
     try:
         return Image.open(path)
     except OSError as error:
@@ -279,13 +263,10 @@ def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
     """The files of a folder whose names match, by the number in the name; none if there is no such folder."""
     found: dict[int, Path] = {}
     for path in sorted(folder.glob("*")):
-        match = re.fullmatch(pattern, path.name, re.IGNORECASE)
-        if match is None:
-            continue
-        number = int(match.group(1))
-        if number in found:
-            raise DataError(f"{folder}: {found[number].name} and {path.name} have the same number; keep one of them")
-        found[number] = path
+        if match := re.fullmatch(pattern, path.name, re.IGNORECASE):
+            first = found.setdefault(int(match.group(1)), path)
+            if first != path:
+                raise DataError(f"{folder}: {first.name} and {path.name} have the same number; keep one of them")
     return found
 
 

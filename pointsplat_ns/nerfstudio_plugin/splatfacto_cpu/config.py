@@ -18,7 +18,7 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConf
 from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuPipelineConfig, SplatfactoCpuTrainer
-from pointsplat_ns.nerfstudio_plugin.stopping import StoppableTrainerConfig
+from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""

@@ -29,11 +29,9 @@ from torchmetrics.image import PeakSignalNoiseRatio
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
-from pointsplat_ns.nerfstudio_plugin.cameras import need_pinhole
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import VIEWER_BACKGROUND, RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, RasterizerOptions, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import CappedStrategy
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
     at_most,
@@ -43,7 +41,6 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
     random_seeds_near_cameras,
 )
 from pointsplat_ns.rasterizer.rendering import Colors
-from pointsplat_ns.system.kernels import Kernels
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
@@ -122,10 +119,6 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
             revised_opacity=False,
             verbose=True,
         )
-
-    def kernels(self) -> dict[str, Kernels]:
-        """Compiled kernels of the rasterizer and of the loss."""
-        return {**super().kernels(), "SSIM": structural_similarity.KERNELS}
 
 
 class SplatfactoCpuModel(SplatfactoModel):
@@ -247,7 +240,10 @@ class SplatfactoCpuModel(SplatfactoModel):
             width, height = int(camera.width.item()), int(camera.height.item())
             return self.get_empty_outputs(width, height, self.background_color.to(self.device))
         camera_to_worlds = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
-        intrinsics, width, height = self._drawn_size(camera)
+        factor = self._get_downscale_factor()
+        width, height = int(camera.width.item()) // factor, int(camera.height.item()) // factor
+        intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
+        intrinsics[:, :2] /= factor
         with_depth = self.config.output_depth_during_training or not self.training
         image, alpha, info = self._draw(params, camera_to_worlds, intrinsics, width, height, with_depth)
         self.last_size = (height, width)
@@ -279,13 +275,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             return params
         inside = self.crop_box.within(self.means).reshape(-1)
         return {name: value[inside] for name, value in params.items()} if inside.any() else None
-
-    def _drawn_size(self, camera: Cameras) -> tuple[Tensor, int, int]:
-        """Intrinsics (1, 3, 3), width and height, in pixels at the resolution of this step."""
-        factor = self._get_downscale_factor()
-        intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
-        intrinsics[:, :2] /= factor
-        return intrinsics, int(camera.width.item()) // factor, int(camera.height.item()) // factor
 
     def _draw(
         self,

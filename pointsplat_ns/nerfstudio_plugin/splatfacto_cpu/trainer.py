@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import math
 import random
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
-from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor, nn
-from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
-from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric
-from pointsplat_ns.nerfstudio_plugin.stopping import STATE, StoppableTrainer
+from pointsplat_ns.nerfstudio_plugin.trainer import STATE, StoppableTrainer
 from pointsplat_ns.system.tensors import FLOATS
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
-
-MOST_SKIPPED_IN_A_ROW = 10
-"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
-and names the photos. One broken photo among sound ones stops nothing."""
 
 _LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
 """Attributes of the datamanager: the frames that are still to come before any is repeated."""
@@ -46,24 +34,11 @@ class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
 
-    def setup(self, **kwargs) -> Any:
-        """Build the pipeline, and let torch read nerfstudio's checkpoints, which happens right after this."""
-        allow_splatfacto_checkpoints()
-        return super().setup(**kwargs)
-
 
 class SplatfactoCpuPipeline(VanillaPipeline):
     """nerfstudio's pipeline. A metric that cannot be computed is null in its evaluation, never NaN."""
 
     datamanager: LazyImageDatamanager
-    latest_losses: Mapping[str, Tensor] = MappingProxyType({})
-    """The parts of the loss of the latest training step."""
-
-    def get_train_loss_dict(self, step: int):
-        """As nerfstudio's, and keeps the parts of the loss."""
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        self.latest_losses = {name: value.detach() for name, value in losses.items()}
-        return outputs, losses, metrics
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -89,92 +64,26 @@ class SplatfactoCpuPipeline(VanillaPipeline):
         return report
 
 
-class CheckingOptimizers(Optimizers):
-    """nerfstudio's optimisers, which leave out an update that would not be finite. Before each update, ``skips`` is
-    called with the groups that have a gradient that is not finite; it returns whether to leave the update out."""
-
-    def __init__(
-        self,
-        config: dict[str, Any],
-        param_groups: dict[str, list[nn.Parameter]],
-        skips: Callable[[list[str]], bool],
-    ):
-        super().__init__(config, param_groups)
-        self._skips = skips
-
-    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """As nerfstudio's. With a gradient scaler (``--mixed-precision``), the scaler deals with what overflows."""
-        if not grad_scaler.is_enabled() and self._skips([name for name in param_groups if not self._finite(name)]):
-            self.zero_grad_all()
-            return
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
-
-    def _finite(self, name: str) -> bool:
-        """Whether all gradients of a group are finite. Its optimiser has its parameters, which densification renews."""
-        groups = self.optimizers[name].param_groups
-        return all_finite(p.grad for group in groups for p in group["params"] if p.grad is not None)
-
-
 class SplatfactoCpuTrainer(StoppableTrainer):
-    """nerfstudio's trainer, which can be stopped at any time and skips steps that are not finite.
-
-    A step whose loss or gradients are not finite changes neither parameters nor the optimisers' state nor what
-    densification gathers. It is counted, and the log names its photo. The learning-rate schedules still advance.
-    """
+    """The trainer of one scene. A skipped step also leaves alone what densification gathers."""
 
     config: SplatfactoCpuTrainerConfig
     pipeline: SplatfactoCpuPipeline
-
-    def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
-        super().__init__(config, local_rank, world_size)
-        self.skipped: Counter[str] = Counter()
-        """Number of steps that were skipped, by photo."""
-        self._skipped_in_a_row = 0
 
     def train(self) -> None:
         """As nerfstudio's."""
         with tiny_as_zero():
             super().train()
 
-    def setup_optimizers(self) -> CheckingOptimizers:
-        """The optimisers."""
-        return CheckingOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._skips)
+    def update(self, step: int, names: list[str], skipped: bool) -> None:
+        """As the base class; densification gathers nothing of a skipped step."""
+        if skipped:
+            self.pipeline.model.forget_step()
+        super().update(step, names, skipped)
 
-    def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """As nerfstudio's, but skips a step whose loss or gradients are not finite. If more than
-        :data:`MOST_SKIPPED_IN_A_ROW` have been skipped without one between that was not, a checkpoint is saved, and a
-        DataError ends training."""
-        loss, losses, metrics = super().one_step(step)
-        metrics["skipped_steps"] = self.skipped.total()
-        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
-            self._stop(step)
-        return loss, losses, metrics
-
-    def _skips(self, faulty: list[str]) -> bool:
-        """Whether to skip the step at hand, given the parameters whose gradient is not finite."""
-        losses = self.pipeline.latest_losses
-        faults = [f"the {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
-        faults = faults or [f"the gradient of the {name} is not finite" for name in faulty]
-        if not faults:
-            self._skipped_in_a_row = 0
-            return False
-        photo = self.pipeline.datamanager.latest_photo
-        self._skipped_in_a_row += 1
-        self.skipped[photo] += 1
-        if self.skipped[photo] == 1:
-            CONSOLE.log(f"step {self.step} is skipped: {photo}: {'; '.join(faults)} (said once for each photo)")
-        self.pipeline.model.forget_step()
-        return True
-
-    def _stop(self, step: int) -> None:
-        """Save a checkpoint and end training with an error that names the photos."""
-        self.save_checkpoint(step)
-        photos = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
-        raise DataError(
-            f"training stopped at step {step}: losses or gradients were not finite in the last "
-            f"{self._skipped_in_a_row} steps, which were skipped ({photos}); repair these photos or leave them out, or "
-            f"lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
-        )
+    def source_of(self, metrics: dict[str, Any]) -> str:
+        """Name of the photo of the latest step."""
+        return self.pipeline.datamanager.latest_photo
 
     def state_to_resume(self) -> dict[str, Any]:
         """Random numbers to come, the order of the photos, and what densification has gathered."""

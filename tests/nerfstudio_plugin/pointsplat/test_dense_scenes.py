@@ -6,13 +6,13 @@ import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
-from making import box_room, without_data
+from making import box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.io.discovery import find_plys
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.nerfstudio_plugin.cameras import eps2d_of, near_plane_of
+from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -83,7 +83,7 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
         camera, data = frames[-1]
         views = Views(
             viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices(), 32, 24, scene.background,
-            near_plane=near_plane_of(camera), eps2d=eps2d_of(camera),
+            **carried(camera),
         )  # fmt: skip
         image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
         # half a level where they are rounded, float32 noise where they are not
@@ -93,13 +93,5 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     with pytest.raises(IndexError):
         scene.rendered_train[6]
     # Every second training picture is subsampled from one of the size that people look at.
-    assert [eps2d_of(camera) for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
-    assert [eps2d_of(camera) for camera, _ in scene.rendered_eval] == 3 * [EPS2D]
-
-
-def test_a_run_whose_data_is_gone_is_learned_from_its_own_renders(trained_walls, tmp_path):
-    without_data(trained_walls, tmp_path / "runs")
-    with pytest.raises(SceneError, match="gone_from_here.*supervision dense"):
-        manager_of(tmp_path / "runs")
-    manager = manager_of(tmp_path / "runs", supervision="dense")
-    assert [scene.has_photos for scene in manager.scenes] == [False, False]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_eval] == 3 * [EPS2D]

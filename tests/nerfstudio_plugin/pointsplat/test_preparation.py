@@ -3,12 +3,9 @@
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from unittest import mock
 
 import pytest
@@ -17,13 +14,14 @@ from making import dense_config, equal
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
-from pointsplat_ns.nerfstudio_plugin.pointsplat.background import NAME, Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
+from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.pruning import PruneSettings
 from pointsplat_ns.refiner import Refiner
 
+NAME = "background_0"
 SECONDS = 120.0
 """How long a test waits for what shall come; it takes some seconds."""
 
@@ -33,34 +31,29 @@ def background_threads() -> list[threading.Thread]:
 
 
 @pytest.fixture(autouse=True)
-def none_of_other_tests():
-    deadline = time.monotonic() + SECONDS
-    while background_threads() and time.monotonic() < deadline:
-        time.sleep(0.01)
+def none_is_left():
+    before = background_threads()  # of pipelines of other tests
+    yield
+    assert [thread for thread in background_threads() if thread not in before] == []
 
 
-@contextmanager
-def after_the_first(owner: object, name: str, before: Callable[[], object]):
-    """Let every call of a function but the first do something before."""
-    function, calls = getattr(owner, name), []
+def called_before(function: Callable, before: Callable[[int], object]) -> Callable:
+    """A function that calls another one, and before that ``before`` with the number of the call."""
+    calls = []
 
     def called(*args, **options):
         calls.append(args)
-        if len(calls) > 1:
-            before()
+        before(len(calls))
         return function(*args, **options)
 
-    with mock.patch.object(owner, name, called):
-        yield
+    return called
 
 
 def test_the_first_step_waits_for_no_scene_but_its_own(three_rooms, run_training, tmp_path):
-    stepped = threading.Event()
+    stepped, step = threading.Event(), PointSplatTrainer.one_step
 
-    def wait():
-        assert stepped.wait(SECONDS), "the first step has not come"
-
-    step = PointSplatTrainer.one_step
+    def wait(call: int) -> None:
+        assert call == 1 or stepped.wait(SECONDS), "the first step has not come"
 
     def one_step(trainer, number):
         result = step(trainer, number)
@@ -68,33 +61,12 @@ def test_the_first_step_waits_for_no_scene_but_its_own(three_rooms, run_training
         return result
 
     with (
-        after_the_first(dense_scenes, "sample_views", wait),
-        after_the_first(PruneSettings, "prune", wait),
+        mock.patch.object(dense_scenes, "sample_views", called_before(dense_scenes.sample_views, wait)),
+        mock.patch.object(PruneSettings, "prune", called_before(PruneSettings.prune, wait)),
         mock.patch.object(PointSplatTrainer, "one_step", one_step),
     ):
         trainer, losses = run_training(dense_config(three_rooms, tmp_path, 3))
-    assert len(losses) == 3 and trainer.step == 2 and not background_threads()
-
-
-def test_the_next_scenes_are_prepared_while_a_step_is_taken(three_rooms, run_training, tmp_path):
-    pruned, three, losses = [], threading.Event(), PointSplatModel.losses
-    prune = PruneSettings.prune
-
-    def counted(settings, scene, progress=None):
-        result = prune(settings, scene, progress)
-        pruned.append(threading.current_thread().name)
-        if len(pruned) == 3:
-            three.set()
-        return result
-
-    def slow(model, index, frames):
-        if model.training:
-            assert three.wait(SECONDS), "the others were not prepared in the first step"
-        return losses(model, index, frames)
-
-    with mock.patch.object(PruneSettings, "prune", counted), mock.patch.object(PointSplatModel, "losses", slow):
-        run_training(dense_config(three_rooms, tmp_path, 2))
-    assert pruned == [NAME] * 3
+    assert len(losses) == 3 and trainer.step == 2
 
 
 def test_losses_do_not_depend_on_when_scenes_are_prepared(three_rooms, run_training, tmp_path):
@@ -141,19 +113,11 @@ def test_a_scene_that_cannot_be_used_ends_the_training_at_its_turn(three_rooms, 
     scene.means.fill_(float("nan"))
     path.unlink()
     write_ply(scene, path)
-    trainer, steps = None, []
-    step = PointSplatTrainer.one_step
-
-    def one_step(self, number):
-        nonlocal trainer
-        trainer = self
-        result = step(self, number)
-        steps.append(number)
-        return result
-
+    steps = []
+    one_step = called_before(PointSplatTrainer.one_step, steps.append)
     with mock.patch.object(PointSplatTrainer, "one_step", one_step), pytest.raises(DataError, match=f"^{path}: "):
         run_training(config)
-    assert steps == [0, 1] and not background_threads()
+    assert len(steps) == 3
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -188,7 +152,7 @@ def test_a_signal_ends_the_preparation_too(number, status, three_rooms, run_trai
             run_training(config)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert end.value.code == status and not background_threads()
+    assert end.value.code == status
     assert [path.name for path in config.get_checkpoint_dir().iterdir()] == ["step-000000000.ckpt"]
 
 
@@ -208,39 +172,8 @@ def test_values_come_in_order_once_with_their_errors_and_none_after_a_stop():
     assert made == [(5, NAME), (0, NAME), (2, NAME)]
     with pytest.raises(ZeroDivisionError):
         background.take(0, make(0))
-    for thread in background_threads():  # there is nothing left to make
-        thread.join(SECONDS)
-    assert not background_threads()
     assert background.take(5, make(5)) == 2 and made[-1] == (5, threading.current_thread().name)
-
-    running = threading.Event()
-
-    def long() -> None:
-        running.set()
-        while True:
-            background.check()
-            time.sleep(0.01)
-
-    background.start("long", long)
-    background.start("next", make(1))
-    assert running.wait(SECONDS)
+    background.start(3, make(3))
     background.stop()
-    assert not background_threads() and made[-1][0] == 5
     background.check()
-    assert background.take("next", make(1)) == 10
-
-
-def test_a_program_ends_while_something_is_being_made():
-    words = """
-import time
-from pointsplat_ns.nerfstudio_plugin.pointsplat.background import Background
-background = Background()
-def long():
-    while True:
-        background.check()
-        time.sleep(0.01)
-background.start("long", long)
-time.sleep(0.1)
-"""
-    ended = subprocess.run([sys.executable, "-c", words], capture_output=True, timeout=SECONDS, check=False)
-    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert background.take(3, make(1)) == 10 and made[-1][1] != NAME

@@ -50,17 +50,6 @@ def test_what_cannot_be_a_scene_says_what_is_wrong(trained_walls, tmp_path):
         manager_of(trained_walls, images_per_step=0)
 
 
-def test_a_run_of_another_method_is_refused_when_it_is_named_itself(wall_config, wall_scene, tmp_path):
-    def nerf(config):
-        from nerfstudio.models.nerfacto import NerfactoModelConfig
-
-        config.method_name, config.pipeline.model = "nerfacto", NerfactoModelConfig()
-
-    run = make_run(tmp_path, wall_config, wall_scene, nerf)
-    with pytest.raises(SceneError, match="method nerfacto; expected a trained Splatfacto run"):
-        manager_of(run)
-
-
 def test_an_unknown_dataparser_and_an_unknown_setting_are_refused(wall_config, wall_scene, tmp_path):
     run = make_run(tmp_path, wall_config, wall_scene)
     config = run / "config.yml"

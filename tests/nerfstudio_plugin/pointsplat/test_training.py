@@ -8,27 +8,13 @@ import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from broken_steps import broken
-from making import dense_config, equal, pipeline_of
-from pointsplat_ns.errors import PointSplatError, SceneError
+from making import dense_config, equal
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
-
-
-def view_loss(model, manager, index: int) -> float:
-    with torch.no_grad():
-        _, losses, _ = model.losses(index, [f for f in manager.scenes[index].train_frames])
-    return float(losses["l1"])
-
-
-def test_training_lowers_the_loss_on_all_views(trained, trained_walls):
-    _, trainer, _ = trained
-    untrained = pipeline_of(trained_walls)
-    model = trainer.pipeline.eval().model
-    before = view_loss(untrained.model, untrained.datamanager, 0)
-    assert view_loss(model, trainer.pipeline.datamanager, 0) < 0.95 * before
 
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
@@ -77,15 +63,15 @@ def step_by_step(config, steps):
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        ("nan", "the l1 loss is nan"),
-        ("infinite", "the l1 loss is inf"),
+        ("nan", "the loss l1 is nan"),
+        ("infinite", "the loss l1 is inf"),
         ("gradient", "the gradient of the scales is not finite"),
     ],
 )
 def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, tmp_path, kind, said):
     config = dense_config(three_rooms, tmp_path, 4)
     config.pipeline.model.norm = "batch"  # has running statistics
-    with broken(kind, {1}), mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.trainer.CONSOLE.log") as log:
+    with broken(kind, {1}), mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log:
         trainer, history = step_by_step(config, range(3))
     weights, states, metrics = zip(*history, strict=True)
     assert equal(weights[1], weights[0]) and equal(states[1], states[0])
@@ -93,30 +79,23 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, t
     moved = [name for name in weights[0] if not torch.equal(weights[2][name], weights[1][name])]
     assert any("running" in name for name in moved) and any("heads" in name for name in moved)
     scene = trainer.pipeline.datamanager.scenes[metrics[1]["scene"]].name
-    assert trainer.pipeline.training_state.skipped == {scene: 1} and [m["skipped_steps"] for m in metrics] == [0, 1, 1]
-    text = f"step 1 is skipped: {scene}: {said} (1 skipped so far; more than 10 stop)"
+    assert trainer.skipped == {scene: 1} and [m["skipped_steps"] for m in metrics] == [0, 1, 1]
+    text = f"step 1 is skipped: {scene}: {said} (said once for each)"
     assert [call.args[0] for call in log.call_args_list if "skipped" in call.args[0]] == [text]
     assert all(schedule.last_epoch == 3 for schedule in trainer.optimizers.schedulers.values()), "it counts steps"
 
 
 def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(three_rooms, run_training, tmp_path):
     config = dense_config(three_rooms, tmp_path, 50)
-    config.max_skipped_steps = 3
     message = (
-        r"training stopped at step 3: losses or gradients were not finite in 4 steps, which were skipped "
-        r"\(room\d: 2, room\d: 1, room\d: 1\); .*lower the learning rates; .*--load-dir .*--max-skipped-steps than 3"
+        r"training stopped at step 3: losses or gradients were not finite in the last 4 steps, which were skipped "
+        r"\(room\d: 2, room\d: 1, room\d: 1\); .*lower the learning rates; .*--load-dir "
     )
-    with broken("nan", set(range(50))), pytest.raises(SceneError, match=message) as caught:
+    with (
+        broken("nan", set(range(50))),
+        mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.MOST_SKIPPED_IN_A_ROW", 3),
+        pytest.raises(DataError, match=message) as caught,
+    ):
         run_training(config)
     assert "\n" not in str(caught.value)
-    saved = torch.load(config.get_checkpoint_dir() / "step-000000003.ckpt", weights_only=True)
-    skipped = saved["pipeline"]["_extra_state"]["skipped"]
-    assert sorted(skipped) == ["room0", "room1", "room2"] and sum(skipped.values()) == 4
-    # what was done so far is kept, and can be gone on from where it is allowed
-    rest = dense_config(three_rooms, tmp_path / "rest", 2)
-    rest.load_dir, rest.max_skipped_steps = config.get_checkpoint_dir(), 4
-    resumed, losses = run_training(rest)
-    assert len(losses) == 2 and resumed.pipeline.training_state.skipped.total() == 4
-    rest.max_skipped_steps = -1
-    with pytest.raises(PointSplatError, match="--max-skipped-steps -1: expected at least 0"):
-        rest.setup(local_rank=0, world_size=1).setup()
+    assert (config.get_checkpoint_dir() / "step-000000003.ckpt").is_file(), "what was done so far is kept"

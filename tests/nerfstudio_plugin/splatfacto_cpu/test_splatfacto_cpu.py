@@ -15,7 +15,7 @@ from nerfstudio.utils import writer
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
-from pointsplat_ns.nerfstudio_plugin.stopping import STATE
+from pointsplat_ns.nerfstudio_plugin.trainer import STATE
 from pointsplat_ns.rasterizer import rasterization
 
 SEED = 20

@@ -1,4 +1,4 @@
-"""nerfstudio's trainer, which can be stopped at any time."""
+"""The trainer of both methods: nerfstudio's, which can be stopped at any time and skips steps that are not finite."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import itertools
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +22,23 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
+from torch import Tensor, nn
 
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.runs import step_of
-from pointsplat_ns.nerfstudio_plugin.rasterizer_options import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
+from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
+from pointsplat_ns.system import processes
 from pointsplat_ns.system.memory import keep_freed_memory
 from pointsplat_ns.system.threads import fixed_threads, suitable_threads
 
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
+
+MOST_SKIPPED_IN_A_ROW = 10
+"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
+and names their photos or scenes. One that is broken among sound ones stops nothing."""
 
 
 @dataclass
@@ -62,11 +69,10 @@ class StoppableTrainerConfig(TrainerConfig):
         try:
             given.parent.mkdir(parents=True, exist_ok=True)
             for number in itertools.count(2):
-                try:
+                with suppress(FileExistsError):
                     self.get_base_dir().mkdir()
                     break
-                except FileExistsError:
-                    self.timestamp = f"{timestamp}_{number}"
+                self.timestamp = f"{timestamp}_{number}"
         except OSError as error:
             raise PointSplatError(
                 f"{given}: cannot be made as the folder of this training ({error.strerror}); name another --output-dir"
@@ -76,11 +82,10 @@ class StoppableTrainerConfig(TrainerConfig):
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or the step in the name of the checkpoint that it resumes from."""
-        if self.load_dir is None:
-            return 0 if self.load_checkpoint is None else _step_after(self.load_checkpoint)
-        if self.load_step is not None:
+        if self.load_dir is not None and self.load_step is not None:
             return self.load_step + 1
-        return max((_step_after(path) for path in self.load_dir.glob("step-*.ckpt")), default=0)
+        paths = [self.load_checkpoint] if self.load_dir is None else self.load_dir.glob("step-*.ckpt")
+        return max((step + 1 for path in paths if path and (step := step_of(path)) is not None), default=0)
 
 
 class StoppableTrainer(Trainer):
@@ -95,6 +100,9 @@ class StoppableTrainer(Trainer):
     Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
     interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
     once.
+
+    A step whose loss or gradients are not finite, in any process, changes neither parameters nor the optimisers' state
+    nor buffers. It is counted, and the log names its photo or scene. The learning-rate schedules still advance.
     """
 
     config: StoppableTrainerConfig
@@ -103,13 +111,23 @@ class StoppableTrainer(Trainer):
     _between_steps = False
     """Whether it was stopped where a checkpoint can be saved."""
 
+    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
+        super().__init__(config, local_rank, world_size)
+        self.skipped: Counter[str] = Counter()
+        """Number of steps that were skipped, by photo or scene, over all processes."""
+        self._skipped_in_a_row = 0
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio's. If the data or a number of steps cannot be used, the run folder, which then holds only the
         config, is removed before the PointSplatError."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
-            self._need_steps()
+            if self.config.max_num_iterations < 1:
+                raise PointSplatError(
+                    f"--max-num-iterations {self.config.max_num_iterations}: expected at least 1; a run is shown and "
+                    "measured without a training by ns-viewer, ns-render and ns-eval"
+                )
             super().setup(test_mode)
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
@@ -124,7 +142,13 @@ class StoppableTrainer(Trainer):
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
         outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
         if outputs is not None:
-            outputs.save_dataparser_transform = functools.partial(_save_whole, outputs.save_dataparser_transform)
+            save = outputs.save_dataparser_transform
+
+            def save_whole(path: Path) -> None:
+                with replacing(path) as part:
+                    save(part)
+
+            outputs.save_dataparser_transform = save_whole
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
 
@@ -162,8 +186,76 @@ class StoppableTrainer(Trainer):
             return self.one_step(step)
 
     def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """One step: the loss, its parts, and other numbers. As nerfstudio's."""
-        return super().train_iteration(step)
+        """The loss, its parts, and numbers for the log, as nerfstudio's ``train_iteration``, which cannot skip a step.
+
+        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow. If more than
+        :data:`MOST_SKIPPED_IN_A_ROW` steps were skipped, a checkpoint is saved, and a DataError ends the training.
+        """
+        pipeline, every = self.pipeline, self.gradient_accumulation_steps
+        buffers = [(buffer, buffer.clone()) for buffer in pipeline.model.buffers()]
+        names = list(self.optimizers.parameters)
+        self.optimizers.zero_grad_some([name for name in names if step % every[name] == 0])
+        device_type = self.device.split(":")[0]
+        with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
+            _, losses, metrics = pipeline.get_train_loss_dict(step=step)
+            loss = functools.reduce(torch.add, losses.values())
+        own: dict[str, Tensor] = metrics.pop("own_losses", losses)
+        faults = [f"the loss {name} is {value.item():g}" for name, value in own.items() if not value.isfinite()]
+        skip = processes.any_rank(bool(faults), self.device)
+        if not skip:
+            self.grad_scaler.scale(loss).backward()
+            if not self.grad_scaler.is_enabled():
+                bad = [name for name in names if not all_finite(p.grad for p in self._trained(name))]
+                faults = [f"the gradient of the {name} is not finite" for name in bad]
+            skip = processes.any_rank(bool(faults), self.device)
+        if skip:
+            self.optimizers.zero_grad_all()
+            with torch.no_grad():
+                for buffer, before in buffers:
+                    buffer.copy_(before)
+            self._count(step, self.source_of(metrics), faults)
+        self.update(step, [] if skip else [name for name in names if step % every[name] == every[name] - 1], skip)
+        metrics["skipped_steps"] = self.skipped.total()
+        if self.config.log_gradients:
+            norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
+            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
+            metrics["Gradients/Total"] = sum(norms.values(), torch.zeros(()))
+        self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
+        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
+            self.save_checkpoint(step)
+            sources = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
+            raise DataError(
+                f"training stopped at step {step}: losses or gradients were not finite in the last "
+                f"{self._skipped_in_a_row} steps, which were skipped ({sources}); mend or leave out what is named, or "
+                f"lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
+            )
+        return loss, losses, metrics
+
+    def update(self, step: int, names: list[str], skipped: bool) -> None:
+        """Step the optimisers of these groups by gradients averaged over processes, and all schedules."""
+        scale = self.grad_scaler.get_scale()
+        if not skipped:
+            for name in names:
+                processes.average_gradients(self._trained(name))
+            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, names)
+            self.grad_scaler.update()
+        if scale <= self.grad_scaler.get_scale():  # as in nerfstudio: not if the scaler skipped the update
+            self.optimizers.scheduler_step_all(step)
+
+    def _trained(self, group: str) -> list[nn.Parameter]:
+        """Parameters of a group: its optimiser has them, also where densification renews them."""
+        return [p for part in self.optimizers.optimizers[group].param_groups for p in part["params"]]
+
+    def source_of(self, metrics: dict[str, Any]) -> str:
+        """Name of the photo or scene of the latest step."""
+        raise NotImplementedError
+
+    def _count(self, step: int, source: str, faults: list[str]) -> None:
+        """Count and log the sources, of all processes, that made a step be skipped."""
+        for name, text in processes.gathered([(source, "; ".join(faults))] if faults else []):
+            self.skipped[name] += 1
+            if self.skipped[name] == 1 and processes.rank() == 0:
+                CONSOLE.log(f"step {step} is skipped: {name}: {text} (said once for each)")
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -181,7 +273,7 @@ class StoppableTrainer(Trainer):
             content[STATE] = state
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         # Unfinished in the run's folder: nerfstudio takes every file beside checkpoints for one.
-        with replacing(path, _tensor_bytes(content), self.base_dir) as part:
+        with replacing(path, tensor_bytes(content), self.base_dir) as part:
             try:
                 torch.save(content, part)
             except RuntimeError as error:  # what torch makes of a disk that is full after all
@@ -201,11 +293,11 @@ class StoppableTrainer(Trainer):
 
         Not where several processes train together: they save together, and one of them cannot stop alone.
         """
-        numbers = []
+        before = {}
         if threading.current_thread() is threading.main_thread() and self.world_size == 1:
-            numbers += [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.default_int_handler else []
-            numbers += [signal.SIGTERM] if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL else []
-        before = {number: signal.signal(number, self._note) for number in numbers}
+            for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+                if signal.getsignal(number) is usual:
+                    before[number] = signal.signal(number, self._note)
         try:
             yield
         finally:
@@ -226,43 +318,25 @@ class StoppableTrainer(Trainer):
             self._between_steps = True
             raise KeyboardInterrupt
 
-    def _need_steps(self) -> None:
-        if self.config.max_num_iterations < 1:
-            raise PointSplatError(
-                f"--max-num-iterations {self.config.max_num_iterations}: expected at least 1; a run is shown and "
-                "measured without a training by ns-viewer, ns-render and ns-eval"
-            )
-
     def _withdraw(self) -> None:
+        """Remove the run folder, and those above it that hold nothing else, if it holds only the config."""
         config = self.base_dir / "config.yml"
         if not config.is_file() or list(self.base_dir.iterdir()) != [config]:
             return
         config.unlink()
-        output_dir = Path(self.config.output_dir)
         for folder in (self.base_dir, *self.base_dir.parents):
-            if folder == output_dir.parent or any(folder.iterdir()):
+            if folder == Path(self.config.output_dir).parent or any(folder.iterdir()):
                 break
             folder.rmdir()
 
 
-def _step_after(checkpoint: Path) -> int:
-    """The step that follows a checkpoint's; 0 if its name does not say which that is."""
-    step = step_of(checkpoint)
-    return 0 if step is None else step + 1
+def all_finite(tensors: Any) -> bool:
+    """Whether all numbers of tensors are finite; None counts as such.
 
-
-def _save_whole(save: Callable[[Path], None], path: Path) -> None:
-    """Save a file by a function that writes it in place."""
-    with replacing(path) as part:
-        save(part)
-
-
-def _tensor_bytes(value: Any) -> int:
-    """Bytes of all tensors in nested dictionaries and lists."""
-    if isinstance(value, Tensor):
-        return value.numel() * value.element_size()
-    parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
-    return sum(map(_tensor_bytes, parts))
+    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, each number is checked.
+    """
+    there = (tensor for tensor in tensors if tensor is not None)
+    return all(bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all()) for tensor in there)
 
 
 def _interrupted(number: int) -> NoReturn:
