@@ -25,7 +25,7 @@ from pointsplat_ns.pruning.scores import log_volume_score, paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
 from pointsplat_ns.refiner import Refiner
-from pointsplat_ns.refiner.normalize import gaussian_features
+from pointsplat_ns.refiner.refiner import gaussian_features
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -13,7 +13,7 @@ from pointsplat_ns.geometry.transforms import (
 )
 from pointsplat_ns.rasterizer import rasterization, reference
 from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
-from pointsplat_ns.refiner.normalize import canonical_quats
+from pointsplat_ns.refiner.refiner import canonical_quats
 
 
 def random_quats(n=200, dtype=torch.float64):

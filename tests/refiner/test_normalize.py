@@ -18,7 +18,8 @@ from pointsplat_ns.refiner.feedback import (
     read_feedback_refiner,
     save_feedback_refiner,
 )
-from pointsplat_ns.refiner.normalize import canonical_quats, gaussian_features, unit_cube
+from pointsplat_ns.refiner.refiner import canonical_quats, gaussian_features
+from pointsplat_ns.refiner.structure import unit_cube
 from pointsplat_ns.refiner.weights import WeightsError
 
 

@@ -4,8 +4,8 @@ import torch.nn.functional as F
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner.config import preset
-from pointsplat_ns.refiner.layers import BatchNorm, SceneNorm
-from pointsplat_ns.refiner.point_transformer import Block, PatchAttention, SubmanifoldConv
+from pointsplat_ns.refiner.network import BatchNorm, Block, PatchAttention, SceneNorm, SubmanifoldConv
+from pointsplat_ns.refiner.sparse_ops import by_patches
 from pointsplat_ns.refiner.structure import build_structure
 
 
@@ -27,31 +27,18 @@ def plain_attention(module: PatchAttention, x: torch.Tensor) -> torch.Tensor:
     return module.proj((weight @ v).transpose(0, 1).reshape(m, c))
 
 
-@pytest.mark.parametrize(("n", "patch"), [(1, 6), (20, 20), (20, 64)])
-def test_attention_with_one_patch_is_plain_attention_whatever_the_order(n, patch):
+@pytest.mark.parametrize(("n", "patch"), [(1, 6), (20, 20), (20, 64), (15, 6)])
+def test_patches_attend_within_themselves_and_the_last_borrows(n, patch):
     torch.manual_seed(0)
     module = PatchAttention(12, 3, patch).double()
-    x = torch.randn(n, 12, dtype=torch.float64)
-    order = torch.randperm(n)
-    expected = plain_attention(module, x)
-    assert torch.allclose(module(x, None), expected, atol=1e-12)
-    assert torch.allclose(module(x, (order, order.argsort())), expected, atol=1e-12)
-
-
-def test_patches_attend_within_themselves_and_the_last_borrows_from_before():
-    torch.manual_seed(0)
-    module = PatchAttention(8, 2, 6).double()
-    x = torch.randn(15, 8, dtype=torch.float64)
-    order = torch.randperm(15)
-    along = x[order]
-    expected = torch.cat(
-        [
-            plain_attention(module, along[:6]),
-            plain_attention(module, along[6:12]),
-            plain_attention(module, along[9:])[3:],
-        ]
-    )
-    assert torch.allclose(module(x, (order, order.argsort()))[order], expected, atol=1e-12)
+    x, order = torch.randn(n, 12, dtype=torch.float64), torch.randperm(n)
+    for along in (None, order):
+        inner = x if along is None else x[along]
+        whole = [plain_attention(module, part) for part in inner.split(patch)]
+        if n % patch and n > patch:
+            whole[-1] = plain_attention(module, inner[n - patch :])[-(n % patch) :]
+        found = by_patches(module, x, 36, patch, None if along is None else (along, along.argsort()))
+        assert torch.allclose(found if along is None else found[along], torch.cat(whole), atol=1e-12)
 
 
 def test_points_of_a_cell_get_the_convolution_of_their_mean():

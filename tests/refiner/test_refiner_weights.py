@@ -1,6 +1,5 @@
 """Weights, their config, and orders of voxels."""
 
-import itertools
 import json
 import math
 import re
@@ -24,7 +23,7 @@ from pointsplat_ns.refiner import (
     save_refiner,
 )
 from pointsplat_ns.refiner.config import RefinerConfig
-from pointsplat_ns.refiner.serialization import curve_codes
+from pointsplat_ns.refiner.structure import curve_codes
 from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
@@ -144,16 +143,16 @@ def little_memory():
 def test_a_configuration_too_large_for_its_file_takes_no_memory(changes, tmp_path, little_memory):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    rewrite(path, config={**trained().config.to_dict(), **changes})
+    rewrite(path, config={**vars(trained().config), **changes})
     with pytest.raises(WeightsError, match="refiner.safetensors: "):
         read_refiner(path)
 
 
-@pytest.mark.parametrize("name", sorted(trained().config.to_dict()))
+@pytest.mark.parametrize("name", sorted(vars(trained().config)))
 def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    right = trained().config.to_dict()
+    right = vars(trained().config)
     refused = 0
     for value in WRONG:
         rewrite(path, config={**right, name: value})
@@ -175,7 +174,7 @@ def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
 def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    header = {"format": REFINER_FORMAT, "config": json.dumps(trained().config.to_dict()), "metadata": "{}"}
+    header = {"format": REFINER_FORMAT, "config": json.dumps(vars(trained().config)), "metadata": "{}"}
     save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
     with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
         (read_refiner if key == "config" else read_metadata)(path)
@@ -193,8 +192,8 @@ def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
         ({"enc_depths": (1, 1)}, "enc_depths has 2 entries; expected 3"),
         ({"dec_heads": (5, 3)}, "dec: 32 channels do not divide into 5 heads"),
         ({"strides": (2, 3)}, "strides holds 3; expected powers of two"),
-        ({"curves": ("z", "peano")}, "expected names out of z, z-trans"),
-        ({"curves": ()}, "expected names out of"),
+        ({"curves": ("z", "peano")}, "expected z, z-trans"),
+        ({"curves": ()}, "curves is (); expected z"),
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"grid": 1000}, "grid is 1000"),
         ({"encoder": "single"}, "encoder is 'single'"),
@@ -211,10 +210,6 @@ def test_contradictory_settings_are_refused_by_name(changes, message):
         preset("tiny", **changes)
 
 
-def full_grid(side: int) -> torch.Tensor:
-    return torch.tensor(list(itertools.product(range(side), repeat=3)))
-
-
 @pytest.mark.parametrize("bits", [16, 20])
 def test_z_order_equals_python_interleaving_at_full_width(bits):
     generator = torch.Generator().manual_seed(0)
@@ -223,13 +218,6 @@ def test_z_order_equals_python_interleaving_at_full_width(bits):
         sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
     ]
     assert curve_codes(coords, bits, ["z"])[0].tolist() == expected
-
-
-def test_unknown_curves_and_widths_are_refused():
-    with pytest.raises(ValueError, match="no curve 'peano'"):
-        curve_codes(full_grid(2), 1, ["peano"])
-    with pytest.raises(ValueError, match="21 bits"):
-        curve_codes(full_grid(2), 21, ["z"])
 
 
 def skilling(point: list[int], bits: int) -> int:
@@ -254,7 +242,7 @@ def skilling(point: list[int], bits: int) -> int:
 
 
 @pytest.mark.parametrize("bits", [1, 2, 5, 16, 19, 20])
-def test_hilbert_tables_give_the_codes_of_the_published_algorithm(bits):
+def test_hilbert_codes_are_those_of_the_published_algorithm(bits):
     coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
     assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
 

@@ -9,12 +9,10 @@ import torch.nn.functional as F
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, preset, sparse_ops
-from pointsplat_ns.refiner import structure as structure_module
-from pointsplat_ns.refiner.config import FINE_BITS
-from pointsplat_ns.refiner.encoder import DualBranchEncoder
-from pointsplat_ns.refiner.normalize import gaussian_features, unit_cube
+from pointsplat_ns.refiner.network import DualBranchEncoder
+from pointsplat_ns.refiner.refiner import gaussian_features
 from pointsplat_ns.refiner.sparse_ops import permute, segment_max, segment_mean, submanifold_conv
-from pointsplat_ns.refiner.structure import STRUCTURE, StructureSettings, build_structure, neighbour_pairs
+from pointsplat_ns.refiner.structure import FINE_BITS, HALF_KERNEL, build_structure, neighbour_pairs, unit_cube
 
 
 def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
@@ -72,26 +70,22 @@ def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
         return len(torch.unique((position * side).floor().clamp(max=side - 1), dim=0))
 
     sides = [2**bits for bits in range(FINE_BITS + 1)]
-    coarsest = next(side for side in sides if occupied(side) >= STRUCTURE.occupancy * n)
+    coarsest = next(side for side in sides if occupied(side) >= 0.6 * n)
     assert structure.levels[0].num_cells == occupied(coarsest) > occupied(coarsest // 2)
 
 
 @pytest.mark.parametrize("spread", [1, 3, 100, 2**16 - 1])
-def test_neighbour_pairs_are_those_of_brute_force_in_order(spread, monkeypatch):
+def test_neighbour_pairs_are_those_of_brute_force_in_order(spread):
     g = torch.Generator().manual_seed(4)
     cells = torch.cat([torch.randint(0, 8, (120, 3), generator=g), torch.tensor([[0, 0, 0], [spread] * 3])])
     cells = torch.unique(torch.cat([cells, spread - cells.clamp(max=spread)]), dim=0).clamp(0, spread)
     cells = torch.unique(cells, dim=0)
     cells = cells[torch.randperm(len(cells), generator=g)]
     expected = []
-    for offset in structure_module.HALF_KERNEL:
+    for offset in HALF_KERNEL:
         match = (cells[:, None] + torch.tensor(offset) == cells[None]).all(dim=-1)
         expected.append(match.nonzero().T.tolist())
-    ways = [0, 2**60] if spread <= 100 else [0]  # a table of 2^48 entries fits nowhere
-    for entries in ways:
-        settings = StructureSettings(table_per_cell=entries, table_limit=2**31)
-        monkeypatch.setattr(structure_module, "STRUCTURE", settings)
-        assert [[i.tolist(), j.tolist()] for i, j in neighbour_pairs(cells)] == expected
+    assert [[i.tolist(), j.tolist()] for i, j in neighbour_pairs(cells)] == expected
 
 
 def features(n: int = 30):
