@@ -136,7 +136,7 @@ class RefinerConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RefinerConfig:
-        """The configuration of a file. Raises RefinerConfigError if a field is unknown or the fields contradict one another."""
+        """The configuration of a file. Raises RefinerConfigError if a field is unknown or fields contradict others."""
         fields = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - fields)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")

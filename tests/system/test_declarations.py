@@ -7,7 +7,7 @@ import subprocess
 import pytest
 import torch
 
-from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping, replacement
+from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
@@ -43,7 +43,7 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 }  // extern "C"
 """
 MODULES = (blending, colors, pictures, projection, tiles, structural_similarity)
-MERGING = (covariance, matching, pair_cost, regrouping, replacement)
+MERGING = (covariance, matching, pair_cost, regrouping)
 KERNELS = [module.KERNELS for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
