@@ -1,4 +1,4 @@
-"""Weights, their config, and orders of voxels."""
+"""Files of weights, also hostile ones, and configurations."""
 
 import json
 import math
@@ -23,7 +23,6 @@ from pointsplat_ns.refiner import (
     save_refiner,
 )
 from pointsplat_ns.refiner.config import RefinerConfig
-from pointsplat_ns.refiner.structure import curve_codes
 from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
@@ -113,12 +112,9 @@ def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
 HUGE = [
     {"enc_channels": [1 << 40, 48, 64]},
     {"enc_channels": [1 << 16, 1 << 16, 1 << 16]},
-    {"enc_channels": [10**400, 48, 64]},
     {"feature_dim": 1 << 16, "color_hidden": 1 << 16, "color_dim": 1 << 16},
     {"head_width": 1 << 40},
     {"head_depth": 1 << 40},
-    {"head_depth": 1 << 16},
-    {"enc_depths": [1 << 30, 1, 1]},
     {"enc_depths": [1 << 16, 1, 1]},
     {"mlp_ratio": 1 << 16},
     {"patch": 1 << 40},
@@ -208,43 +204,6 @@ def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
 def test_contradictory_settings_are_refused_by_name(changes, message):
     with pytest.raises(RefinerConfigError, match=re.escape(message)):
         preset("tiny", **changes)
-
-
-@pytest.mark.parametrize("bits", [16, 20])
-def test_z_order_equals_python_interleaving_at_full_width(bits):
-    generator = torch.Generator().manual_seed(0)
-    coords = torch.randint(0, 2**bits, (50, 3), generator=generator)
-    expected = [
-        sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
-    ]
-    assert curve_codes(coords, bits, ["z"])[0].tolist() == expected
-
-
-def skilling(point: list[int], bits: int) -> int:
-    """Hilbert code of one point, bit by bit, as published."""
-    axes = list(point)
-    for bit in range(bits - 1, 0, -1):
-        low = (1 << bit) - 1
-        for i in range(3):
-            if axes[i] >> bit & 1:
-                axes[0] ^= low
-            else:
-                swapped = (axes[0] ^ axes[i]) & low
-                axes[0] ^= swapped
-                axes[i] ^= swapped
-    axes[1] ^= axes[0]
-    axes[2] ^= axes[1]
-    parity = 0
-    for bit in range(bits - 1, 0, -1):
-        if axes[2] >> bit & 1:
-            parity ^= (1 << bit) - 1
-    return sum(((axis ^ parity) >> b & 1) << (3 * b + 2 - i) for i, axis in enumerate(axes) for b in range(bits))
-
-
-@pytest.mark.parametrize("bits", [1, 2, 5, 16, 19, 20])
-def test_hilbert_codes_are_those_of_the_published_algorithm(bits):
-    coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
-    assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
 
 
 def test_unknown_names_are_refused():
