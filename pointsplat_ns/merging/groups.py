@@ -90,11 +90,6 @@ class Groups:
         return len(self.group) > len(self.first)
 
 
-def merged_groups(participants: Participants, state: State, tree: Tree) -> Groups:
-    """The groups of the rounds so far, in the order of the state."""
-    return Groups.of(participants, state, tree.groups(), tree.shares())
-
-
 def first_members(participants: Participants, group: Tensor, count: int) -> Tensor:
     """Index in the scene of the first member of each of ``count`` groups, (K,) int64."""
     first = torch.full((count,), len(participants.scene), **INDICES)

@@ -24,7 +24,7 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.merging.duplicates import Copies, Reduced
 from pointsplat_ns.merging.finishing import Finish, finished
-from pointsplat_ns.merging.groups import Groups, Tree, merged_groups, scene_maker
+from pointsplat_ns.merging.groups import Groups, Tree, scene_maker
 from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.replacement import replace_pairs
@@ -208,7 +208,7 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
     and tree to save memory."""
 
     def groups() -> Groups:
-        found = merged_groups(step.participants, step.state, step.tree)
+        found = Groups.of(step.participants, step.state, step.tree.groups(), step.tree.shares())
         if last:
             del step.state, step.tree
         return found
@@ -286,7 +286,7 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     tree = step.tree.after_round(first, second, shares)
 
     def remaining() -> Gaussians:
-        groups = merged_groups(participants, state, tree)
+        groups = Groups.of(participants, state, tree.groups(), tree.shares())
         return scene_maker(participants, groups, settings)[1](0.0)
 
     reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)

@@ -103,7 +103,7 @@ class ColourAxes(NamedTuple):
 def initial_state(
     participants: Participants,
     weights: Tensor,
-    axes: ColourAxes | None = None,
+    colour_axes: ColourAxes | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> State:
     """The state before the first round.
@@ -111,16 +111,19 @@ def initial_state(
     Args:
         participants: n Gaussians of a scene.
         weights: (n,) visibility weight of each per unit of area.
-        axes: of the colours; by default the principal axes of the participants.
+        colour_axes: by default the principal axes of the participants.
         dtype: float64 for a reference, which kernels do not take.
     """
     scene, members = participants.scene, participants.members
     centre, size = participants.centre.double(), participants.size
+    middle, axes = colour_axes or principal_axes(scene, members)
     return State(
         means=in_pieces(lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype),
         cov=in_pieces(lambda rows: (covariances_of(scene, rows) / size**2).clamp(-1e30, 1e30), members, 6, dtype=dtype),
         alphas=torch.sigmoid(scene.opacities[members, 0]).to(dtype),
-        colours=_on_axes(scene, members, axes or principal_axes(scene, members)),
+        colours=in_pieces(
+            lambda rows: (_coefficients(scene, rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32
+        ),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
         centre=centre,
@@ -154,12 +157,3 @@ def principal_axes(scene: Gaussians, members: Tensor) -> ColourAxes:
     covariance = products - len(members) * mean[:, None] * mean
     axes = torch.linalg.eigh(covariance).eigenvectors[:, -8:].float()
     return ColourAxes((shift + mean).float(), axes)
-
-
-def _on_axes(scene: Gaussians, members: Tensor, axes: ColourAxes) -> Tensor:
-    """Colours (n, C) of members (n,) on axes, around their middle."""
-
-    def on_axes(rows: Tensor) -> Tensor:
-        return (_coefficients(scene, rows) - axes.middle) @ axes.axes
-
-    return in_pieces(on_axes, members, axes.axes.shape[1], dtype=torch.float32)
