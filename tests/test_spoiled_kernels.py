@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping, replacement
+from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping
 from pointsplat_ns.metrics import structural_similarity
 from pointsplat_ns.rasterizer import compiled as rasterizer
 from pointsplat_ns.system.native import FLAGS, INCLUDE
@@ -57,7 +57,6 @@ def compiled(tmp_path_factory):
         pytest.param(covariance, "2 * (x * y - w * z)", "2 * (x * y)", 1, id="a rotation"),
         pytest.param(pair_cost, "ik = wi * ii + wj * ij", "ik = wi * ii", 1, id="a cost"),
         pytest.param(matching, "j > i ? (cost", "j < i ? (cost", 1, id="a pair"),
-        pytest.param(replacement, "wj * sj.xy + both * (apart.x * apart.y)", "wj * sj.xy", 1, id="a covariance"),
         pytest.param(regrouping, "(cov[1] + x * y)", "(cov[1] - x * y)", 1, id="a fit"),
         pytest.param(structural_similarity, "- square + C2;", "+ C2;", 1, id="a variance"),
         pytest.param(structural_similarity, "column - REACH * task.step,", "column,", 1, id="a border's gradient"),

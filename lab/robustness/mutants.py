@@ -87,7 +87,7 @@ PARTS = {
     "repair": Part(
         tuple(f"pointsplat_ns/compression/{name}.py" for name in ("repair", "feedback", "optimiser")),
         ("tests/compression/test_[fr]e*.py",),
-        ("tests/refiner/test_normalize.py", _SAME_RESULT, "tests/compression/*.py"),
+        ("tests/refiner/test_augmentation.py", _SAME_RESULT, "tests/compression/*.py"),
     ),
 }
 """Parts of the code. A pattern takes modules and tests that are moved within their folder along."""

@@ -30,10 +30,8 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.participants import Participants
 from pointsplat_ns.merging.regrouping import Members, best_groups, group_moments
-from pointsplat_ns.merging.replacement import replace_pairs
-from pointsplat_ns.merging.state import initial_state
+from pointsplat_ns.merging.state import Participants, initial_state
 from pointsplat_ns.merging.visibility import sampled_viewpoints
 from pointsplat_ns.rasterizer import pixels_of
 
@@ -43,22 +41,21 @@ Part = Callable[[bool], object]
 def parts_of(scene: Gaussians) -> dict[str, Part]:
     """The parts of merging, by name, as functions of whether they use compiled kernels."""
     participants = Participants.of(scene, scene.usable().nonzero()[:, 0])
-    state = initial_state(participants, torch.ones(len(participants)), MERGING)
+    state = initial_state(participants, torch.ones(len(participants)))
     near = other_neighbours(state.means.double(), MERGING.neighbours)
     costs = pair_costs(state, near)
-    first, second = cheapest_pairs(near, costs.clone(), int(MERGING.round_share * len(state)))
+    most = int(MERGING.round_share * len(state))
     members, count = Members(scene, participants.members), count_of(KEEP, len(state))
     group = torch.arange(len(state)) * count // len(state)  # neighbours along the curve
     groups = group_moments(members, group, count)
     parts: dict[str, Part] = {
         "costs of pairs": lambda compiled: pair_costs(state, near, compiled=compiled),
-        "matching": lambda compiled: cheapest_pairs(near, costs.clone(), len(first), compiled=compiled),
-        "replacement": lambda compiled: replace_pairs(state, first, second, MERGING, compiled),
+        "matching": lambda compiled: cheapest_pairs(near, costs.clone(), most, compiled=compiled),
         "choice of groups": lambda compiled: best_groups(members, group, groups, compiled=compiled),
     }
     whole = participants.in_units(scene)
     if viewpoints := sampled_viewpoints(Sampler(whole), MERGING):
-        view = viewpoints.views.resized(MERGING.visibility_side)[0]
+        view = viewpoints.views.resized(112)[0]
         parts["visible pixels, a view"] = lambda compiled: pixels_of(whole, view, compiled)
     return parts
 

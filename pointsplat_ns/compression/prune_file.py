@@ -20,7 +20,8 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.merging.cells import Scratch, merge_file
+from pointsplat_ns.merging.by_cells import merge_file
+from pointsplat_ns.merging.cells import Scratch
 from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.system.progress import Progress, silent

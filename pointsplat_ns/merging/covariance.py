@@ -84,12 +84,15 @@ def thinnest_axes(six: Tensor) -> Tensor:
     This axis is the dominant eigenvector of the adjugate. Squaring the matrix three times makes it dominate (power
     iteration).
     """
-    matrix = unpack(adjugate(six))
+    matrix = adjugate(six)
     for _ in range(3):
-        matrix = matrix / matrix.diagonal(dim1=1, dim2=2).sum(1).clamp_min(MIN_DIVISOR)[:, None, None]
-        matrix = matrix @ matrix
-    column = matrix.diagonal(dim1=1, dim2=2).argmax(1)
-    vector = matrix[torch.arange(len(matrix), device=six.device, dtype=torch.int64), column]
+        trace = (matrix[:, 0] + matrix[:, 3] + matrix[:, 5]).clamp_min(MIN_DIVISOR)
+        a, b, c, d, e, f = (matrix / trace[:, None]).unbind(1)
+        squared = [a * a + b * b + c * c, a * b + b * d + c * e, a * c + b * e + c * f]
+        squared += [b * b + d * d + e * e, b * c + d * e + e * f, c * c + e * e + f * f]
+        matrix = torch.stack(squared, dim=1)
+    column = matrix[:, [0, 3, 5]].argmax(1)
+    vector = unpack(matrix)[torch.arange(len(matrix), device=six.device, dtype=torch.int64), column]
     length = vector.norm(dim=1, keepdim=True)
     return torch.where(length > MIN_DIVISOR, vector / length.clamp_min(MIN_DIVISOR), vector.new_tensor([0.0, 0.0, 1.0]))
 

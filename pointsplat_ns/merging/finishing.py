@@ -1,4 +1,4 @@
-"""How a scene is finished: one factor for the sizes of all merged Gaussians, chosen by renders.
+"""How groups become a scene: members are regrouped, and one factor for all sizes is chosen by renders.
 
 How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
 and differs between scenes. The factor is chosen by the PSNR against the dense scene in pictures of the
@@ -11,7 +11,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from torch import Tensor
+
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.sizes import RendersOfSizes
+from pointsplat_ns.merging.groups import Groups, scene_maker
+from pointsplat_ns.merging.regrouping import regrouped
+from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.merging.state import Participants
+from pointsplat_ns.system.memory import give_back_freed_memory
 
 
 @dataclass(frozen=True)
@@ -34,18 +42,41 @@ class Finish:
         return f"{factor}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"
 
 
-def best_finish(psnr_of: Callable[[float], float], settings: MergeSettings = MERGING) -> Finish:
-    """The best size change of those tried: three, and the top of the parabola through them.
+def finished(
+    participants: Participants, groups: Groups, reference: RendersOfSizes | None, regroup: bool, settings: MergeSettings
+) -> tuple[Tensor, Gaussians, Finish]:
+    """The group (n,) of each participant, in the order of their first members, and the scene of the groups with the
+    finish that suits it.
 
     Args:
-        psnr_of: PSNR of the scene with a size change, dB.
-        settings: the trials.
+        participants: n Gaussians.
+        groups: after the last round.
+        reference: renders that the scene is compared with; None compares nothing.
+        regroup: whether members may change groups.
+        settings: of regrouping.
     """
-    tried = {change: psnr_of(change) for change in settings.size_changes}
-    top = top_of_parabola(settings.size_changes, list(tried.values()), settings.size_change_margin)
+    any_merged = groups.any_merged
+    if regroup and any_merged and settings.regrouping_rounds > 0:
+        groups = regrouped(participants, groups, settings)
+    give_back_freed_memory()
+    group, make = scene_maker(participants, groups, settings)
+    del groups
+    give_back_freed_memory()
+    finish = Finish()
+    if reference is not None and any_merged:
+        finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))))
+    return group, make(finish.size_change), finish
+
+
+def best_finish(psnr_of: Callable[[float], float]) -> Finish:
+    """The best size change of those tried: three, and the top of the parabola through them, a little outside of them at
+    most. ``psnr_of`` gives the PSNR of the scene with a size change, dB."""
+    changes = (-0.1, 0.0, 0.05)
+    tried = {change: psnr_of(change) for change in changes}
+    top = top_of_parabola(changes, list(tried.values()), margin=0.05)
     tried[top] = psnr_of(top)
     best = max(tried, key=lambda change: tried[change])
-    return Finish(best, psnr=tried[best], psnr_before=tried.get(0.0))
+    return Finish(best, psnr=tried[best], psnr_before=tried[0.0])
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:

@@ -1,16 +1,69 @@
-"""Groups: the participants that were merged into one Gaussian each, and that Gaussian."""
+"""Which Gaussians were merged into which, the groups that they form, and the scene of one Gaussian for each group."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.merging.participants import Participants
-from pointsplat_ns.merging.state import State
-from pointsplat_ns.merging.tree import Tree
-from pointsplat_ns.system.tensors import INDICES
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import quaternions_of
+from pointsplat_ns.merging.covariance import MIN_DIVISOR, unpack
+from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.merging.state import Participants, State
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """The pairs of all rounds, over n Gaussians, of which K remain."""
+
+    parents: Tensor  # [n] int32, the Gaussian that each was merged into, itself if it remains
+    remaining: Tensor  # [K] int64, ascending indices of those that remain
+    rounds: tuple[tuple[Tensor, Tensor, Tensor], ...] = ()
+    """First and second members (int32) of the pairs of each round, and the share of the first in the mass (float32)."""
+
+    @classmethod
+    def of_single(cls, n: int) -> Tree:
+        """The tree before the first round."""
+        return cls(torch.arange(n, dtype=torch.int32, device="cpu"), torch.arange(n, **INDICES))
+
+    def after_round(self, first: Tensor, second: Tensor, shares: Tensor) -> Tree:
+        """The tree after another round.
+
+        Args:
+            first, second: (E,) each, indices of the members of its pairs among those that remain.
+            shares: (E,) float32, of the first in the mass of each pair.
+        """
+        stays = torch.ones(len(self.remaining), **FLAGS)
+        stays[second] = False
+        i, j = (self.remaining[these].to(torch.int32) for these in (first, second))
+        parents = self.parents.clone()
+        parents[j.long()] = i
+        return Tree(parents, self.remaining[stays], (*self.rounds, (i, j, shares)))
+
+    def groups(self) -> Tensor:
+        """The index among those that remain of the Gaussian that each is part of, (n,) int64."""
+        roots = self.parents
+        while not torch.equal(above := roots[roots.long()], roots):
+            roots = above
+        group = torch.empty(len(roots), **INDICES)
+        group[self.remaining] = torch.arange(len(self.remaining), **INDICES)
+        return group[roots.long()]
+
+    def shares(self) -> Tensor:
+        """Share of each in the mass of the Gaussian that it is part of, (n,) float32: the product of its shares in all
+        rounds, from the last to the first."""
+        shares = torch.ones(len(self.parents), **FLOATS)
+        for first, second, share in reversed(self.rounds):
+            i, j = first.long(), second.long()
+            shares[j] = shares[i] * (1 - share)
+            shares[i] *= share
+        return shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,35 +79,93 @@ class Groups:
     counts: Tensor  # [K] int32, number of members
 
     @classmethod
-    def of(cls, state: State, group: Tensor, shares: Tensor, first: Tensor) -> Groups:
+    def of(cls, participants: Participants, state: State, group: Tensor, shares: Tensor) -> Groups:
         """The groups that became the Gaussians of a state."""
+        first = first_members(participants, group, len(state))
         return cls(group, shares, first, *state.in_scene_units(), state.alphas.double(), state.counts)
-
-    def __len__(self) -> int:
-        return len(self.means)
 
     @property
     def any_merged(self) -> bool:
         """Whether any group has more than one member."""
-        return bool((self.counts > 1).any())
-
-    def in_order(self) -> Groups:
-        """The groups in the order of their first members."""
-        order = self.first.argsort()
-        rank = torch.empty_like(order)
-        rank[order] = torch.arange(len(order), **INDICES)
-        ordered = (values[order] for values in (self.first, self.means, self.cov, self.alphas, self.counts))
-        return Groups(rank[self.group], self.shares, *ordered)
-
-
-def merged_groups(participants: Participants, state: State, tree: Tree) -> Groups:
-    """The groups of the rounds so far, in the order of the state."""
-    group = tree.groups()
-    first = first_members(participants, group, len(state))
-    return Groups.of(state, group, tree.shares(), first)
+        return len(self.group) > len(self.first)
 
 
 def first_members(participants: Participants, group: Tensor, count: int) -> Tensor:
     """Index in the scene of the first member of each of ``count`` groups, (K,) int64."""
     first = torch.full((count,), len(participants.scene), **INDICES)
     return first.scatter_reduce_(0, group, participants.members, "amin")
+
+
+def scene_maker(
+    participants: Participants, groups: Groups, settings: MergeSettings
+) -> tuple[Tensor, Callable[[float], Gaussians]]:
+    """The scene of K groups, in the order of their first members. A group of one member is that member to the bit.
+
+    Returns:
+        The group (n,) of each participant, and a function from a size change, which is added to the log-scales of
+        merged Gaussians, to the scene.
+    """
+    order = groups.first.argsort()
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), **INDICES)
+    group, shares = rank[groups.group], groups.shares
+    first, means, cov, alphas, members = (
+        values[order] for values in (groups.first, groups.means, groups.cov, groups.alphas, groups.counts)
+    )
+    del groups
+    scene, counts = participants.scene, members.double()
+    single = (counts == 1)[:, None]
+    log_scales, quats = _axes(cov, scene.dtype)
+    del cov
+    means = torch.where(single, scene.means[first], means.to(scene.dtype))
+    quats = torch.where(single, scene.quats[first], quats)
+
+    # Merging spreads mass over a larger area, so that more of the background shows through. At 10 %, the exponent gains
+    # 0.4 dB in flowers, 0.6 in a bouquet and nothing in three other scenes.
+    alphas = deepened(alphas, counts, 0.15, settings.max_opacity)
+    logits = torch.logit(alphas, 1e-7)[:, None].to(scene.dtype)
+    sh = _mean_sh(participants, group, shares, single[:, 0])
+    own_scales, opacities = scene.scales[first], torch.where(single, scene.opacities[first], logits)
+
+    def make(size_change: float) -> Gaussians:
+        scales = torch.where(single, own_scales, (log_scales + size_change).to(scene.dtype))
+        return Gaussians(means, scales, quats, opacities, *sh, **scene.traits._asdict())
+
+    return group, make
+
+
+def deepened(alphas: Tensor, counts: Tensor, exponent: float, max_opacity: float) -> Tensor:
+    """Opacities (n,) of Gaussians of ``counts`` (n,) members: 1 - (1 - alpha)^(counts^exponent), their optical depth
+    times counts^exponent."""
+    depth = -torch.log1p(-alphas.clamp_max(max_opacity)) * counts.double() ** exponent
+    return (-torch.expm1(-depth)).clamp_max(ALPHA_MAX)
+
+
+def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: Tensor) -> tuple[Tensor, Tensor]:
+    """SH coefficients (K, 3) and (K, (d+1)^2 - 1, 3): means over the members by their ``shares`` (n,) of their groups
+    (n,). Those of a group of one, ``single`` (K,), are its own to the bit."""
+    scene = participants.scene
+    wide = torch.promote_types(scene.dtype, torch.float32)
+    means = []
+    for values in (scene.features_dc, scene.features_rest):
+        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device="cpu")
+        for rows in torch.arange(len(group), **INDICES).split(CHUNK):
+            own = values[participants.members[rows]].to(wide)
+            mean.index_add_(0, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
+            of_single = single[group[rows]]
+            mean[group[rows][of_single]] = own[of_single]
+        means.append(mean.to(scene.dtype))
+    return means[0], means[1]
+
+
+def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
+    scales, quats = torch.empty(len(cov), 3, **DOUBLES), torch.empty(len(cov), 4, dtype=dtype, device="cpu")
+    for rows in torch.arange(len(cov), **INDICES).split(CHUNK):
+        variances, axes = torch.linalg.eigh(unpack(cov[rows]))
+        axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+        # as covariances(): rounding leaves nothing of what is thinner
+        variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
+        scales[rows] = 0.5 * variances.log()
+        quats[rows] = quaternions_of(axes).to(dtype)
+    return scales, quats

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
-from pointsplat_ns.system.pieces import CHUNK
-from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
-from pointsplat_ns.system.threads import in_threads, most_threads
+from pointsplat_ns.system.tensors import FLAGS, INDICES
+from pointsplat_ns.system.threads import most_threads
 
 
 def cheapest_pairs(
@@ -50,67 +49,46 @@ def candidate_pairs(
 
 
 def _candidates(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The pairs that all passes take: first and second members, (E,) int64 each, and costs, (E,) float32."""
-    n = len(near)
-    costs = _symmetric(near, costs)
-    free = torch.ones(n, **FLAGS)
-    rows = torch.arange(n, **INDICES)
-    firsts, seconds, prices = [], [], []
+    """As :func:`candidate_pairs`, in torch."""
+    n, costs = len(near), _symmetric(near, costs)
+    rows, others, found = torch.arange(n, **INDICES), near.long(), []
     for _ in range(passes):
+        keys = _keys(rows, costs[rows])
         best = torch.full((n,), torch.iinfo(torch.int64).max, **INDICES)
-        for these in rows.split(CHUNK):
-            keys = _keys(these, costs)
-            best[these] = torch.minimum(best[these], keys.amin(1))
-            best.scatter_reduce_(0, near[these].flatten().long(), keys.flatten(), "amin")
-        found = []
-        for these in rows.split(CHUNK):
-            keys, others = _keys(these, costs), near[these].long()
-            mutual = (keys == best[these][:, None]) & (keys == best[others]) & costs[these].isfinite()
-            row, slot = mutual.nonzero(as_tuple=True)
-            found.append((these[row], others[row, slot], costs[these[row], slot]))
-        first, second, price = (torch.cat(parts) for parts in zip(*found, strict=True))
-        if len(first) == 0:
-            break
-        firsts.append(first)
-        seconds.append(second)
-        prices.append(price)
-        free[first] = False
-        free[second] = False
-        rows = rows[free[rows]]
-        for these in rows.split(CHUNK):
-            costs[these] = costs[these].where(free[near[these].long()], math.inf)
+        best[rows] = keys.amin(1)
+        best.scatter_reduce_(0, others[rows].flatten(), keys.flatten(), "amin")
+        mutual = (keys == best[rows, None]) & (keys == best[others[rows]]) & costs[rows].isfinite()
+        row, slot = mutual.nonzero(as_tuple=True)
+        i = rows[row]
+        found.append((i, others[i, slot], costs[i, slot]))
+        taken = torch.zeros(n, **FLAGS)
+        taken[i] = taken[others[i, slot]] = True
+        costs = costs.masked_fill(taken[:, None] | taken[others], math.inf)
         rows = rows[costs[rows].amin(1) < math.inf]
-        if len(rows) == 0:
+        if len(i) == 0 or len(rows) == 0:
             break
-    if not firsts:
-        return torch.empty(0, **INDICES), torch.empty(0, **INDICES), torch.empty(0, **FLOATS)
-    return torch.cat(firsts), torch.cat(seconds), torch.cat(prices)
+    first, second, price = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return first, second, price
 
 
 def _symmetric(near: Tensor, costs: Tensor) -> Tensor:
     """Costs (n, k) with each pair once: the mean of its two costs in the row of the smaller index, infinity in the row
     of the other. A Gaussian with itself costs infinity."""
-    result = torch.empty_like(costs)
-
-    def fill(me: Tensor) -> None:
-        others = near[me].long()
-        back = near[others] == me[:, None, None]
-        both, slot = back.any(2), back.to(torch.uint8).argmax(2)
-        mean = (costs[me] + costs[others, slot]) / 2
-        mine = costs[me].where(~both, mean.where(others > me[:, None], math.inf))
-        result[me] = mine.where(others != me[:, None], math.inf).nan_to_num(nan=math.inf, posinf=math.inf)
-
-    in_threads(fill, torch.arange(len(near), **INDICES).split(CHUNK), near.device)
-    return result
+    others, me = near.long(), torch.arange(len(near), **INDICES)[:, None]
+    back = near[others] == me[:, :, None]
+    slot = back.to(torch.uint8).argmax(2)
+    mean = ((costs + costs[others, slot]) / 2).where(others > me, math.inf)
+    once = mean.where(back.any(2), costs).where(others != me, math.inf)
+    return once.nan_to_num(nan=math.inf, posinf=math.inf)
 
 
 def _keys(rows: Tensor, costs: Tensor) -> Tensor:
-    """Numbers (m, k) int64 that are ordered as the costs of rows (m,), all different: the bits of a float32 that is not
-    negative are ordered as the float is."""
+    """Numbers (m, k) int64 that are ordered as the costs (m, k) of rows (m,), all different: the bits of a float32 that
+    is not negative are ordered as the float is."""
     k = costs.shape[1]
     numbers = rows[:, None] * k + torch.arange(k, **INDICES)
     # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
-    return (costs[rows].view(torch.int32).long() << 32) | ((numbers * 2654435761) & 0xFFFFFFFF)
+    return (costs.view(torch.int32).long() << 32) | ((numbers * 2654435761) & 0xFFFFFFFF)
 
 
 def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,7 @@
 // What pairs cost, for float32 on a CPU.
 //
-// pair_cost.py calls this file where it was built; pair_cost.py and projections.py do
-// the same in torch, say where the formulas are from, and have the names that are used here. A vector holds up to eight
-// neighbours of one Gaussian.
+// pair_cost.py calls this file where it was built. It does the same in torch, and has the formulas, the bounds and the
+// names that are used here. A vector holds up to eight neighbours of one Gaussian.
 
 #include <new>
 
@@ -16,19 +15,9 @@ struct Planes {
     int64_t triples[13][3];      // directions in which a Gaussian is compared that is largest in one
 };
 
-struct Limits {
-    double max_coordinate, max_width, min_width, roundness, min_divisor, max_growth;
-};
-
-struct Contrasts {
-    double channels, min_contrast, background_contrast, background_decay, min_cover;
-    double max_opacity, growth_exponent, max_growth_ratio;
-};
-
 struct Costs {
     Planes planes;
-    Limits limits;
-    Contrasts contrasts;
+    double background_decay, min_cover, max_opacity, growth_exponent;
     const float *means, *cov, *alphas;  // [n, 3], [n, 6], [n]
     const float *colours, *weights;     // [n, axes], [n]
     int64_t count, axes, neighbours;
@@ -44,6 +33,8 @@ namespace {
 constexpr int PLANES = 13;
 constexpr int TABLE = 12;  // mean, covariance, opacity, squared length of the colour, direction
 constexpr int MOST_AXES = 16, MOST_BLOCKS = 4;
+constexpr double MOST = 1e3;  // bound of coordinates and of standard deviations
+constexpr float ROUNDNESS = 1e-5, MIN_VARIANCE = 1e-6 * 1e-6, TINY = 1e-30;
 
 struct Flat {
     Lane u, v, uu, uv, vv, area;
@@ -83,7 +74,7 @@ struct Some {
     }
 
     // Projections, with centres relative to ``from``.
-    Flat on(const Plane& plane, const Lane (&from)[3], float roundness, float min_variance, float min_divisor) const {
+    Flat on(const Plane& plane, const Lane (&from)[3]) const {
         Flat flat = {};
         for (int i = 0; i < 3; ++i) {
             const Lane apart = from[i] - mean[i];
@@ -94,15 +85,15 @@ struct Some {
             flat.uv += cov[i] * plane.to_plane[i][1];
             flat.vv += cov[i] * plane.to_plane[i][2];
         }
-        const Lane added = roundness * (flat.uu + flat.vv) + min_variance;
+        const Lane added = ROUNDNESS * (flat.uu + flat.vv) + MIN_VARIANCE;
         flat.uu += added, flat.vv += added;
-        flat.area = root(larger(flat.uu * flat.vv - flat.uv * flat.uv, ZERO + min_divisor));
+        flat.area = root(larger(flat.uu * flat.vv - flat.uv * flat.uv, ZERO + TINY));
         return flat;
     }
 };
 
-inline Lane overlap_of_sum(Lane uu, Lane uv, Lane vv, Lane areas, Lane u, Lane v, float min_divisor) {
-    const Lane inverse = 1.0f / larger(uu * vv - uv * uv, ZERO + min_divisor);
+inline Lane overlap_of_sum(Lane uu, Lane uv, Lane vv, Lane areas, Lane u, Lane v) {
+    const Lane inverse = 1.0f / larger(uu * vv - uv * uv, ZERO + TINY);
     const Lane distance = larger(((vv * u - 2.0f * uv * v) * u + uu * v * v) * inverse, ZERO);
     return exp2_of(distance * -0.72134752044f) * root(inverse) * areas;  // 0.5 log2 e
 }
@@ -114,13 +105,13 @@ extern "C" {
 // Means and covariances within the bounds, and the direction in which each is largest.
 void pointsplat_projected(const Costs* task, int64_t* next) {
     const Costs& c = *task;
-    const double most = c.limits.max_width * c.limits.max_width;
+    const double most = MOST * MOST;
     each_range(next, c.count, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             float* row = c.table + TABLE * i;
             for (int d = 0; d < 3; ++d) {
                 const double at = c.means[3 * i + d];
-                row[d] = static_cast<float>(std::min(std::max(at, -c.limits.max_coordinate), c.limits.max_coordinate));
+                row[d] = static_cast<float>(std::min(std::max(at, -MOST), MOST));
             }
             double cov[6];
             for (int d = 0; d < 6; ++d) cov[d] = c.cov[6 * i + d];
@@ -147,13 +138,8 @@ void pointsplat_projected(const Costs* task, int64_t* next) {
 
 void pointsplat_pair_costs(const Costs* task, int64_t* next) {
     const Costs& c = *task;
-    const Contrasts& s = c.contrasts;
-    const float roundness = c.limits.roundness, min_divisor = c.limits.min_divisor;
-    const float min_variance = c.limits.min_width * c.limits.min_width;
-    const float assumed = s.channels * s.min_contrast * s.min_contrast, min_cover = s.min_cover;
-    const float hole = s.channels * s.background_contrast * s.background_contrast;
-    const float max_growth = c.limits.max_growth;
-    const float max_opacity = s.max_opacity, exponent = s.growth_exponent, max_ratio = s.max_growth_ratio;
+    const float assumed = 3.0 * 0.01 * 0.01, hole = 3.0 * 0.3 * 0.3, min_cover = c.min_cover;
+    const float max_opacity = c.max_opacity, exponent = c.growth_exponent, max_ratio = 4.0, max_growth = 100.0;
     const int neighbours = static_cast<int>(c.neighbours), axes = static_cast<int>(c.axes);
     const int blocks = (neighbours + LANES - 1) / LANES;
     each_range(next, c.count, [&](int64_t, int64_t first_row, int64_t last_row) {
@@ -171,22 +157,22 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
             const int largest = static_cast<int>(c.table[TABLE * i + 11]);
             for (int d = 0; d < 3; ++d) {
                 const Plane plane(c, static_cast<int>(c.planes.triples[largest][d]));
-                const Flat first = me.on(plane, me.mean, roundness, min_variance, min_divisor);
+                const Flat first = me.on(plane, me.mean);
                 Flat seconds[MOST_BLOCKS];
                 Lane overlaps[MOST_BLOCKS], around[MOST_AXES];
                 float cover = 0.5f * me.alpha[0];
                 for (int axis = 0; axis < axes; ++axis) around[axis] = cover * me.colours[axis];
                 for (int b = 0; b < blocks; ++b) {
-                    const Flat second = seconds[b] = others[b].on(plane, me.mean, roundness, min_variance, min_divisor);
+                    const Flat second = seconds[b] = others[b].on(plane, me.mean);
                     overlaps[b] = overlap_of_sum(
                         first.uu + second.uu, first.uv + second.uv, first.vv + second.vv, first.area * second.area,
-                        second.u, second.v, min_divisor);
+                        second.u, second.v);
                     Lane on_first = others[b].alpha * overlaps[b] / first.area;
                     for (int lane = neighbours - b * LANES; lane < LANES; ++lane) on_first[lane] = 0.0f;
                     cover += sum(on_first);
                     for (int axis = 0; axis < axes; ++axis) around[axis] += sum(on_first * others[b].colours[axis]);
                 }
-                const float per_cover = 1.0f / std::max(cover, min_divisor);
+                const float per_cover = 1.0f / std::max(cover, TINY);
                 float rr = 0.0f, ir = 0.0f;
                 for (int axis = 0; axis < axes; ++axis) {
                     around[axis] *= per_cover;
@@ -195,7 +181,7 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
                 const float ii = std::max(me.squared_colour[0] - 2.0f * ir + rr, 0.0f) + assumed;
                 const float gii = 0.5f * me.alpha[0] * me.alpha[0] * first.area[0], mi = me.alpha[0] * first.area[0];
                 const float counted = 1.0f / (std::max(cover, min_cover) * std::max(cover, min_cover));
-                const float through = hole * std::exp(static_cast<float>(-s.background_decay) * cover);
+                const float through = hole * std::exp(static_cast<float>(-c.background_decay) * cover);
                 for (int b = 0; b < blocks; ++b) {
                     const Some& other = others[b];
                     const Flat& second = seconds[b];
@@ -206,11 +192,11 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
                     const Lane u = second.u, v = second.v, both = me.alpha * other.alpha * overlaps[b];
                     // the replacement
                     const Lane mj = other.alpha * second.area;
-                    const Lane wi = mi / larger(mi + mj, ZERO + min_divisor), wj = 1.0f - wi, wu = wi * wj * u, wv = wi * wj * v;
+                    const Lane wi = mi / larger(mi + mj, ZERO + TINY), wj = 1.0f - wi, wu = wi * wj * u, wv = wi * wj * v;
                     Lane uu = wu * u + wi * first.uu + wj * second.uu;
                     Lane uv = wu * v + wi * first.uv + wj * second.uv;
                     Lane vv = wv * v + wi * first.vv + wj * second.vv;
-                    Lane area = root(larger(uu * vv - uv * uv, ZERO + min_divisor));
+                    Lane area = root(larger(uu * vv - uv * uv, ZERO + TINY));
                     Lane alpha = larger(mi + mj - both, ZERO) / area;
                     const Lane factor = each(alpha, [&](float value) {
                         return value > max_opacity ? std::pow(std::min(value / max_opacity, max_ratio), exponent) : 1.0f;
@@ -218,9 +204,9 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
                     uu *= factor, uv *= factor, vv *= factor, area *= factor;
                     alpha = smaller(alpha, ZERO + max_opacity);
                     const Lane oik = overlap_of_sum(
-                        first.uu + uu, first.uv + uv, first.vv + vv, first.area * area, wj * u, wj * v, min_divisor);
+                        first.uu + uu, first.uv + uv, first.vv + vv, first.area * area, wj * u, wj * v);
                     const Lane ojk = overlap_of_sum(
-                        second.uu + uu, second.uv + uv, second.vv + vv, second.area * area, wi * u, wi * v, min_divisor);
+                        second.uu + uu, second.uv + uv, second.vv + vv, second.area * area, wi * u, wi * v);
                     // the changes
                     const Lane ik = wi * ii + wj * ij, jk = wj * jj + wi * ij, kk = wi * ik + wj * jk;
                     const Lane gjj = 0.5f * other.alpha * other.alpha * second.area, gkk = 0.5f * alpha * alpha * area;

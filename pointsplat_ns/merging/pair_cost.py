@@ -17,8 +17,10 @@ and counts as well:
 The factor g^2 is empirical: E and H do not see how a large replacement blurs what is merged with it later. On five
 scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers draw 6 % fewer Gaussians on a pixel; g^3 loses with poses.
 
-W_i is the visibility weight of i. c_0, b, c_min and d are ``min_contrast``, ``background_contrast``, ``min_cover`` and
-``background_decay`` of the settings. The replacement has the common mass, centre and covariance, as in
+W_i is the visibility weight of i. c_0 = 0.01 and b = 0.3 are contrasts that are assumed, with the surroundings and with
+the far background; c_min and d are ``min_cover`` and ``background_decay`` of the settings.
+
+The replacement has the common mass, centre and covariance, as in
 :mod:`~pointsplat_ns.merging.replacement`, with areas in the plane. All integrals are sums of overlaps, which
 have a closed form:
 
@@ -26,31 +28,64 @@ have a closed form:
 
 A_pq is the area of the summed covariance S_p + S_q, and d_pq the Mahalanobis distance of the centres under it.
 
-A compiled kernel (``pair_cost.cpp``) does all of it where it was built, in float32. In torch below, E and H are
-written out in these overlaps: no difference of pictures or of colours is stored for each pair.
-
-Shapes: n Gaussians, m of them at once, k neighbours of each, C colour axes.
+The three directions are that of the thirteen axes and diagonals of a cube in which the projection of i is largest, and
+two across. Lengths are in units of the size of the scene's content, and bounded such that float32 holds squares of
+products of four of them. A compiled kernel (``pair_cost.cpp``) computes costs where it was built, or torch.
 """
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.merging import projections as planes
-from pointsplat_ns.merging.projections import DIRECTIONS, PROJECTION_LIMITS, Projections, area_of, directions_of
+from pointsplat_ns.merging.covariance import pack, plane_axes
 from pointsplat_ns.merging.replacement import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
 
-GAUSSIANS_AT_ONCE = 1 << 14
-"""Number of Gaussians whose pairs are computed at once: about 50 MB."""
+TINY = 1e-30
+"""Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
+
+DIRECTIONS = torch.nn.functional.normalize(
+    torch.tensor([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if way > (0, 0, 0)], **DOUBLES)
+)
+"""Unit vectors (13, 3)."""
+
+
+def _projection_matrices() -> tuple[Tensor, Tensor]:
+    """For each direction the two axes of its plane, (13, 3, 2), and the matrix that turns the six numbers of a
+    covariance into the three of its projection, (13, 6, 3)."""
+    axes = torch.stack(plane_axes(DIRECTIONS), dim=2)
+    u, v = axes[..., 0], axes[..., 1]
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        x, y, z = a.unbind(1)
+        p, q, r = b.unbind(1)
+        return torch.stack([x * p, x * q + y * p, x * r + z * p, y * q, y * r + z * q, z * r], dim=1)
+
+    return axes, torch.stack([row(u, u), row(u, v), row(v, v)], dim=2)
+
+
+def _perpendicular_triples() -> Tensor:
+    """Indices (13, 3) of each direction and of two more, as perpendicular to it and to each other as there are."""
+    cosines = (DIRECTIONS @ DIRECTIONS.T).abs()
+    rows = []
+    for first in range(len(DIRECTIONS)):
+        second = int(cosines[first].sort(stable=True).indices[0])
+        third = int((cosines[first] + cosines[second]).sort(stable=True).indices[0])
+        rows.append([first, second, third])
+    return torch.tensor(rows, **INDICES)
+
+
+PLANE_AXES, TO_PLANE = _projection_matrices()
+TRIPLES = _perpendicular_triples()
 
 
 def pair_costs(
@@ -65,7 +100,7 @@ def pair_costs(
     Args:
         state: n Gaussians.
         near: (n, k) indices of the neighbours of each.
-        settings: contrasts and cover of the cost, growth of the replacement.
+        settings: of the cost and of the growth of the replacement.
         dtype: precision of the costs; torch projects Gaussians in float64.
         compiled: False leaves it to torch; True warns if there are no kernels.
 
@@ -76,167 +111,99 @@ def pair_costs(
     fits = near.shape[1] <= 32 and state.colours.shape[1] <= 16 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
-    n = len(state)
-    directions = torch.empty(n, 3, dtype=torch.uint8, device="cpu")
-    everyone = torch.arange(n, **INDICES).split(GAUSSIANS_AT_ONCE)
+    costs = torch.empty(near.shape, dtype=dtype, device="cpu")
 
-    def choose(rows: Tensor) -> None:
-        directions[rows] = directions_of(state, rows).to(torch.uint8)
+    def fill(rows: Tensor) -> None:
+        _, cov = _within_bounds(state, rows)
+        flat = (cov @ TO_PLANE.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
+        largest = (flat[..., 0] * flat[..., 2] - flat[..., 1] ** 2).argmax(1)
+        planes = TRIPLES[largest].unbind(1)
+        total = sum(costs_in_plane(state, rows, near[rows].long(), plane, settings, dtype) for plane in planes)
+        costs[rows] = total * state.weights[rows, None]
 
-    in_threads(choose, everyone, near.device)
-    projections = Projections.empty(state, dtype)
-    costs = torch.zeros(near.shape, dtype=dtype, device="cpu")
-    for direction in range(len(DIRECTIONS)):
-        compared = (directions == direction).any(1).nonzero()[:, 0]
-        if len(compared) == 0:
-            continue
-
-        def fill(rows: Tensor, direction: int = direction) -> None:
-            projections.fill(state, rows, direction)
-
-        def add(rows: Tensor) -> None:
-            costs[rows] += costs_in_plane(projections, rows, near[rows], settings)
-
-        in_threads(fill, everyone, near.device)
-        in_threads(add, compared.split(GAUSSIANS_AT_ONCE), near.device)
-    return costs.mul_(state.weights[:, None])
+    in_threads(fill, torch.arange(len(state), **INDICES).split(1 << 14), near.device)  # 50 MB at once
+    return costs
 
 
 class Flat(NamedTuple):
-    """Gaussians in a plane: the columns of :class:`Projections`, (m, 1) or (m, k) each."""
+    """Projections of Gaussians, all of one shape."""
 
-    u: Tensor
-    v: Tensor
     uu: Tensor
     uv: Tensor
     vv: Tensor
-    area: Tensor
-    alpha: Tensor
-    squared_colour: Tensor
+
+    def area(self) -> Tensor:
+        """Root of the determinant, in units of 2 pi."""
+        return (self.uu * self.vv - self.uv * self.uv).clamp_min(TINY).sqrt()
+
+    def overlap(self, other: Flat, u: Tensor, v: Tensor) -> Tensor:
+        """The integral of the product of two projections whose centres are (u, v) apart; the fast form of
+        :func:`~pointsplat_ns.merging.covariance.overlap`, for covariances that are not nearly lines."""
+        both = Flat(self.uu + other.uu, self.uv + other.uv, self.vv + other.vv)
+        distance = (both.vv * u * u - 2 * both.uv * u * v + both.uu * v * v) / both.area() / both.area()
+        return self.area() * other.area() / both.area() * torch.exp(-0.5 * distance.clamp_min(0))
 
 
-class Replacement(NamedTuple):
-    """Replacements of pairs in a plane, (m, k) each."""
+def costs_in_plane(
+    state: State, i: Tensor, j: Tensor, plane: Tensor, settings: MergeSettings, dtype: torch.dtype
+) -> Tensor:
+    """The cost of merging Gaussians ``i`` (m,) with their neighbours ``j`` (m, k) in the planes ``plane`` (m,) of
+    :data:`DIRECTIONS`, without visibility weights, (m, k)."""
+    everyone = torch.cat([i[:, None], j], dim=1)
+    means, cov = (values.view(*everyone.shape, -1) for values in _within_bounds(state, everyone.flatten()))
+    u, v = ((means[:, :1] - means[:, 1:]) @ PLANE_AXES[plane]).to(dtype).unbind(2)
+    uu, uv, vv = (cov @ TO_PLANE[plane]).to(dtype).unbind(2)
+    # float32 must tell thin projections from lines: widths are at least 0.3 % of lengths
+    added = 1e-5 * (uu + vv) + 1e-6**2
+    both = Flat(uu + added, uv, vv + added)
+    first, second = (Flat(*(values[:, part] for values in both)) for part in (slice(1), slice(1, None)))
+    alphas, colours = state.alphas[everyone].to(dtype), state.colours[everyone].to(dtype)
+    ai, aj, mi, mj = alphas[:, :1], alphas[:, 1:], alphas[:, :1] * first.area(), alphas[:, 1:] * second.area()
+    oij = first.overlap(second, u, v)
 
-    wi: Tensor  # share of the first member in the mass
-    wj: Tensor
-    uu: Tensor
-    uv: Tensor
-    vv: Tensor
-    area: Tensor
-    alpha: Tensor
+    on_first = torch.cat([0.5 * ai, aj * oij / first.area()], dim=1)
+    cover = on_first.sum(1, keepdim=True)
+    surroundings = (on_first[:, None] @ colours) / cover.clamp_min(TINY)[:, :, None]
+    f = colours - surroundings
+    assumed = 3 * 0.01**2
+    ii, jj = (f.square().sum(2) + assumed).split([1, j.shape[1]], dim=1)
+    ij = (f[:, :1] * f[:, 1:]).sum(2) + assumed
 
-
-def costs_in_plane(projections: Projections, i: Tensor, j: Tensor, settings: MergeSettings) -> Tensor:
-    """The cost in one direction of merging Gaussians ``i`` (m,) with their neighbours ``j`` (m, k), without visibility
-    weights, (m, k)."""
-    m, k = j.shape
-    neighbours = j.flatten()
-    first = Flat(*projections.table.index_select(0, i).T.contiguous().view(8, m, 1))
-    second = Flat(*projections.table.index_select(0, neighbours).T.contiguous().view(8, m, k))
-    ci = projections.colours.index_select(0, i)
-    cj = projections.colours.index_select(0, neighbours).view(m, k, -1)
-    u, v = first.u - second.u, first.v - second.v
-    oij = overlap_of_sum(
-        first.uu + second.uu, first.uv + second.uv, first.vv + second.vv, first.area * second.area, u, v
-    )
-    cover, surroundings = _surroundings(first, second, oij, ci, cj)
-    both = first.alpha * second.alpha * oij
-    merged = _replacement(first, second, u, v, both, settings)
-    oik, ojk = (
-        overlap_of_sum(one.uu + merged.uu, one.uv + merged.uv, one.vv + merged.vv, one.area * merged.area, w * u, w * v)
-        for one, w in ((first, merged.wj), (second, merged.wi))
-    )
-    products = _colour_products(first, second, ci, cj, surroundings, settings)
-    colour_change, cover_change = _changes(first, second, merged, both, oik, ojk, products)
-    holes = 3 * settings.background_contrast**2 * torch.exp(-settings.background_decay * cover)
-    change = colour_change.div_(cover.clamp_min(settings.min_cover).square()).addcmul_(cover_change, holes)
-    return change.mul_((merged.area / (first.area + second.area)).clamp_max_(PROJECTION_LIMITS.max_growth).square_())
-
-
-def overlap_of_sum(uu: Tensor, uv: Tensor, vv: Tensor, areas: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Overlap of two projections, in units of 2 pi; the fast form of
-    :func:`~pointsplat_ns.merging.covariance.overlap`, for covariances that are not nearly lines.
-
-    Args:
-        uu, uv, vv: summed covariance.
-        areas: product of both areas.
-        u, v: from one centre to the other.
-    """
-    inverse = (uu * vv).addcmul_(uv, uv, value=-1).clamp_min_(PROJECTION_LIMITS.min_divisor).reciprocal_()
-    distance = (vv * u).addcmul_(uv, v, value=-2).mul_(u).addcmul_(uu * v, v).mul_(inverse).clamp_min_(0)
-    return distance.mul_(-0.5).exp_().mul_(inverse.sqrt_()).mul_(areas)
-
-
-def _surroundings(first: Flat, second: Flat, oij: Tensor, ci: Tensor, cj: Tensor) -> tuple[Tensor, Tensor]:
-    """Cover (m, 1) of each first member by itself and its neighbours, and the mean colour (m, C) of that."""
-    on_first = second.alpha * oij / first.area
-    cover = first.alpha / 2 + on_first.sum(1, keepdim=True)
-    colour = torch.baddbmm((first.alpha / 2 * ci)[:, None], on_first[:, None], cj)[:, 0]
-    return cover, colour / cover.clamp_min(PROJECTION_LIMITS.min_divisor)
-
-
-def _replacement(first: Flat, second: Flat, u: Tensor, v: Tensor, both: Tensor, settings: MergeSettings) -> Replacement:
-    """The replacement of each pair, whose centres are (u, v) apart and which covers ``both`` twice."""
-    mi, mj = first.alpha * first.area, second.alpha * second.area
-    wi = mi / (mi + mj).clamp_min_(PROJECTION_LIMITS.min_divisor)
+    wi = mi / (mi + mj).clamp_min(TINY)
     wj = 1 - wi
-    wu, wv = wi * wj * u, wi * wj * v
-    uu = (wu * u).addcmul_(wi, first.uu).addcmul_(wj, second.uu)
-    uv = (wu * v).addcmul_(wi, first.uv).addcmul_(wj, second.uv)
-    vv = (wv * v).addcmul_(wi, first.vv).addcmul_(wj, second.vv)
-    area = area_of(uu, uv, vv)
-    alpha = (mi + mj).sub_(both).clamp_min_(0).div_(area)
-    if bool((alpha > settings.max_opacity).any()):
-        factor = growth(alpha, settings)
-        uu, uv, vv, area = uu * factor, uv * factor, vv * factor, area * factor
-        alpha = alpha.clamp_max_(settings.max_opacity)
-    return Replacement(wi, wj, uu, uv, vv, area, alpha)
+    shares = (wi * wj * u * u, wi * wj * u * v, wi * wj * v * v)
+    merged = Flat(*(between + wi * one + wj * other for between, one, other in zip(shares, first, second, strict=True)))
+    ak = (mi + mj - ai * aj * oij).clamp_min(0) / merged.area()
+    grown = growth(ak, settings)
+    merged, ak = Flat(*(values * grown for values in merged)), ak.clamp_max(settings.max_opacity)
+    oik, ojk = first.overlap(merged, wj * u, wj * v), second.overlap(merged, wi * u, wi * v)
+
+    ik, jk = wi * ii + wj * ij, wj * jj + wi * ij  # products of colours with that of the replacement
+    gii, gjj, gkk = 0.5 * ai * mi, 0.5 * aj * mj, 0.5 * ak * ak * merged.area()
+    gij, gik, gjk = 2 * ai * aj * oij, 2 * ai * ak * oik, 2 * aj * ak * ojk
+    colour = ii * gii + jj * gjj + (wi * ik + wj * jk) * gkk + ij * gij - ik * gik - jk * gjk
+    holes = gii + gjj + gkk + gij - gik - gjk
+    change = colour.clamp_min(0) / cover.clamp_min(settings.min_cover).square()
+    change += holes.clamp_min(0) * (3 * 0.3**2 * torch.exp(-settings.background_decay * cover))
+    return change * (merged.area() / (first.area() + second.area())).clamp_max(100.0).square()  # points grow unbounded
 
 
-def _colour_products(
-    first: Flat, second: Flat, ci: Tensor, cj: Tensor, surroundings: Tensor, settings: MergeSettings
-) -> tuple[Tensor, Tensor, Tensor]:
-    """<f_i, f_i> (m, 1), <f_j, f_j> and <f_i, f_j> (m, k), each with the contrast 3 c_0^2 that is assumed."""
-    assumed = 3 * settings.min_contrast**2
-    rr = surroundings.square().sum(1, keepdim=True)
-    ir = (ci * surroundings).sum(1, keepdim=True)
-    ij, jr = (torch.stack([ci, surroundings], dim=1) @ cj.mT).unbind(1)
-    return (
-        (first.squared_colour - 2 * ir + rr).clamp_min_(0) + assumed,
-        second.squared_colour.sub(jr, alpha=2).add_(rr).clamp_min_(0).add_(assumed),
-        ij.sub_(jr).add_(rr - ir + assumed),
-    )
-
-
-def _changes(
-    first: Flat,
-    second: Flat,
-    merged: Replacement,
-    both: Tensor,
-    oik: Tensor,
-    ojk: Tensor,
-    products: tuple[Tensor, Tensor, Tensor],
-) -> tuple[Tensor, Tensor]:
-    """E and H of each pair, (m, k), from the six overlaps and the six products of colours."""
-    ii, jj, ij = products
-    ik, jk = (merged.wi * ii).addcmul_(merged.wj, ij), (merged.wj * jj).addcmul_(merged.wi, ij)
-    kk = (merged.wi * ik).addcmul_(merged.wj, jk)
-    gii, gjj, gkk = (one.alpha * one.alpha * one.area / 2 for one in (first, second, merged))
-    gij, gik, gjk = 2 * both, 2 * first.alpha * merged.alpha * oik, 2 * second.alpha * merged.alpha * ojk
-    colour = (jj * gjj).addcmul_(ii, gii).addcmul_(kk, gkk).addcmul_(ij, gij)
-    colour.addcmul_(ik, gik, value=-1).addcmul_(jk, gjk, value=-1).clamp_min_(0)
-    cover = (gjj + gii).add_(gkk).add_(gij).sub_(gik).sub_(gjk).clamp_min_(0)
-    return colour, cover
+def _within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (m, 3) and covariances (m, 6) of some Gaussians, within 1000 sizes of the content, float64."""
+    means, cov = state.means[rows].double().clamp_(-1e3, 1e3), state.cov[rows].double()
+    total = cov[:, 0] + cov[:, 3] + cov[:, 5]
+    return means, cov * (1e6 / total.clamp_min(1e6))[:, None]
 
 
 def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     """As :func:`pair_costs`, float32."""
     count, library = len(state), KERNELS.library
     costs = torch.empty(near.shape, **FLOATS)
-    limits = KERNELS.structs["Limits"](**vars(PROJECTION_LIMITS))
+    tables = {"axes": PLANE_AXES, "to_plane": TO_PLANE, "triples": TRIPLES}
+    planes = KERNELS.structs["Planes"](**{name: tuple(table.flatten().tolist()) for name, table in tables.items()})
+    names = ("background_decay", "min_cover", "max_opacity", "growth_exponent")
     task = KERNELS.structs["Costs"](
-        planes=_planes(), limits=limits, contrasts=_contrasts(settings), means=state.means, cov=state.cov,
+        planes=planes, **{name: getattr(settings, name) for name in names}, means=state.means, cov=state.cov,
         alphas=state.alphas, colours=state.colours.contiguous(), weights=state.weights, count=count,
         axes=state.colours.shape[1], neighbours=near.shape[1], table=torch.empty(count, 12, **FLOATS),
         near=near.contiguous(), costs=costs,
@@ -244,17 +211,6 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
         on_threads(count >= SEVERAL, function, task, threads=most_threads())
     return costs
-
-
-def _planes() -> Struct:
-    tables = {"axes": planes.PLANE_AXES, "to_plane": planes.TO_PLANE, "triples": planes.TRIPLES}
-    return KERNELS.structs["Planes"](**{name: tuple(table.flatten().tolist()) for name, table in tables.items()})
-
-
-def _contrasts(settings: MergeSettings) -> Struct:
-    names = ("min_contrast", "background_contrast", "background_decay", "min_cover", "max_opacity", "growth_exponent")
-    values = {name: getattr(settings, name) for name in (*names, "max_growth_ratio")}
-    return KERNELS.structs["Contrasts"](channels=3, **values)
 
 
 def _as_torch() -> bool:
@@ -266,9 +222,8 @@ def _as_torch() -> bool:
         return torch.rand(*shape, generator=generator, **FLOATS)
 
     factors = 0.1 * random(count, 3, 3)
-    cov = (factors @ factors.mT).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     state = State(
-        means=random(count, 3) - 0.5, cov=cov, alphas=random(count), colours=random(count, 5),
+        means=random(count, 3) - 0.5, cov=pack(factors @ factors.mT), alphas=random(count), colours=random(count, 5),
         weights=random(count), counts=torch.ones(count, dtype=torch.int32, device="cpu"),
         centre=torch.zeros(3, **DOUBLES), size=1.0,
     )  # fmt: skip

@@ -26,10 +26,9 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import NearestOf
 from pointsplat_ns.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
 from pointsplat_ns.merging.groups import Groups, first_members
-from pointsplat_ns.merging.participants import Participants
 from pointsplat_ns.merging.replacement import enlarged
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import bounded_colours
+from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
@@ -43,11 +42,10 @@ class Members:
     Args:
         scene: N Gaussians on the CPU.
         rows: (n,) indices of the members in it.
-        settings: ``max_colour``.
     """
 
-    def __init__(self, scene: Gaussians, rows: Tensor, settings: MergeSettings = MERGING):
-        self._scene, self._rows, self._settings = scene, rows, settings
+    def __init__(self, scene: Gaussians, rows: Tensor):
+        self._scene, self._rows = scene, rows
         self.masses = torch.empty(len(rows), **DOUBLES)
         """Opacity times root mean square area, (n,)."""
         for these in self.pieces():
@@ -72,7 +70,7 @@ class Members:
 
     def colours(self, these: slice) -> Tensor:
         """Colours (m, 3) float32 of SH degree 0 of a piece, colour units."""
-        return bounded_colours(self._scene.features_dc[self._rows[these]], self._settings)
+        return bounded_colours(self._scene.features_dc[self._rows[these]])
 
     def __getitem__(self, these: slice) -> Piece:
         return Piece(self.means(these), self.cov(these), self.colours(these))
@@ -104,9 +102,7 @@ class Moments:
         )
 
 
-def regrouped(
-    participants: Participants, group: Tensor, areas: Tensor, alphas: Tensor, settings: MergeSettings
-) -> Groups:
+def regrouped(participants: Participants, groups: Groups, settings: MergeSettings) -> Groups:
     """Groups whose members fit them better.
 
     The mass of a group may differ from the sum of its members' masses, because members overlap. The ratio of both is
@@ -114,11 +110,12 @@ def regrouped(
 
     Args:
         participants: n Gaussians.
-        group: (n,) the group of each, of K.
-        areas, alphas: (K,) float64 root mean square area and opacity of the groups.
+        groups: their groups, of which membership, sizes and opacities count.
         settings: ``regrouping_rounds`` and how members choose.
     """
-    members, count = Members(participants.scene, participants.members, settings), len(alphas)
+    group, alphas, areas = groups.group, groups.alphas, areas_of(groups.cov)
+    del groups
+    members, count = Members(participants.scene, participants.members), len(alphas)
     common = group_moments(members, group, count)
     ratios = alphas * areas / common.mass.clamp_min(MIN_DIVISOR)
     for _ in range(settings.regrouping_rounds):
@@ -182,18 +179,18 @@ def best_groups(
     settings: MergeSettings = MERGING,
     compiled: bool | None = None,
 ) -> Tensor:
-    """The group (n,) that each member fits best, of its own and the nearest. The heaviest member of each group stays,
-    so that no group is empty.
+    """The group (n,) that each member fits best, of its own and the six nearest. The heaviest member of each group
+    stays, so that no group is empty.
 
     Args:
         members: n members.
         group: (n,) the group of each.
         groups: moments of the groups.
-        settings: ``regrouping_candidates`` and ``regrouping_contrast``.
+        settings: ``regrouping_contrast``.
         compiled: False leaves it to torch; True warns if there are no kernels.
     """
     result = torch.empty_like(group)
-    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, settings.regrouping_candidates)
+    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, 6)
     for these in members.pieces():
         piece, own = members[these], group[these]
         near = nearest(piece.means)

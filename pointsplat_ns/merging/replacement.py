@@ -9,14 +9,12 @@ With the mass ``m = a A`` of opacity a and root mean square area A, and the shar
     opacity      a_k = (a_i P_i + a_j P_j - a_i a_j <G_i, G_j>) / P_k
 
 P is the area of the projection along the thinnest axis of S_k, and <G_i, G_j> the overlap of both projections, which
-both members cover and the replacement covers once. Where a_k is above the largest opacity, the area grows instead. A
-compiled kernel (``replacement.cpp``) computes it, or torch.
+both members cover and the replacement covers once. Where a_k is above the largest opacity, the area grows instead.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -25,51 +23,36 @@ from pointsplat_ns.merging.covariance import (
     MIN_DIVISOR,
     outer,
     overlap,
-    pack,
     plane_axes,
     projected,
     projected_area,
     rms_area,
     thinnest_axes,
 )
-from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import State, bounded
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
-from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
-from pointsplat_ns.system.threads import most_threads
 
 
-def replace_pairs(
-    state: State, first: Tensor, second: Tensor, settings: MergeSettings, compiled: bool | None = None
-) -> tuple[State, Tensor]:
+def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Tensor]:
     """Replace disjoint pairs, each in the place of its first member.
 
     Args:
         state: n Gaussians.
         first, second: (E,) each, indices of the members.
-        settings: ``max_opacity``, ``growth_exponent``, ``max_growth_ratio``.
-        compiled: False leaves it to torch; True warns if there is no kernel.
+        settings: ``max_opacity`` and ``growth_exponent``.
 
     Returns:
         The state of n - E Gaussians, and the share of the first member in each pair's mass, (E,) float32.
     """
-    if KERNELS.usable_for(compiled, state.means):
-        return _by_kernels(state, first, second, settings)
     stays = torch.ones(len(state), **FLAGS)
     stays[second] = False
     place = stays.cumsum(0) - 1
-    after = replace(
-        state,
-        means=state.means[stays],
-        cov=state.cov[stays],
-        alphas=state.alphas[stays],
-        colours=state.colours[stays],
-        weights=state.weights[stays],
-        counts=state.counts[stays],
-    )
+    rows = stays.nonzero()[:, 0]
+    names = ("means", "cov", "alphas", "colours", "weights", "counts")
+    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in names})
     shares = torch.empty(len(first), **FLOATS)
-    for part in torch.arange(len(first), **INDICES).split(CHUNK):
+    for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
         i, j = first[part], second[part]
         k = place[i]
         wi, *replacements = _replacements(state, i, j, settings)
@@ -101,7 +84,7 @@ def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -
     u, v = ((apart * axis).sum(1) for axis in axes)
     mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
     alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)
-    return wi, mean, bounded(enlarged(cov, alphas, settings)), alphas.clamp_max(settings.max_opacity)
+    return wi, mean, enlarged(cov, alphas, settings).clamp(-1e30, 1e30), alphas.clamp_max(settings.max_opacity)
 
 
 def enlarged(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
@@ -110,48 +93,6 @@ def enlarged(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
 
 
 def growth(alphas: Tensor, settings: MergeSettings) -> Tensor:
-    """Factor of the area of Gaussians that need opacities ``alphas``, any shape; 1 up to ``max_opacity``."""
-    return (alphas / settings.max_opacity).clamp(1, settings.max_growth_ratio) ** settings.growth_exponent
-
-
-def _by_kernels(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Tensor]:
-    """As :func:`replace_pairs`."""
-    n, count = len(state), len(state) - len(first)
-    partner = torch.full((n,), -1, **INDICES)
-    partner[first] = second
-    stays = torch.ones(n, **FLAGS)
-    stays[second] = False
-    source = stays.nonzero()[:, 0]
-    names = ("means", "cov", "alphas", "colours", "weights", "counts")
-    before = {name: getattr(state, name).contiguous() for name in names}
-    after = {name: values.new_empty(count, *values.shape[1:]) for name, values in before.items()}
-    shares = torch.empty(count, **FLOATS)
-    remaining = KERNELS.structs["Remaining"]
-    task = KERNELS.structs["Replacing"](
-        before=remaining(**before), after=remaining(**after), source=source, partner=partner[source], count=count,
-        axes=state.colours.shape[1], min_divisor=MIN_DIVISOR, max_opacity=settings.max_opacity,
-        growth_exponent=settings.growth_exponent, max_growth_ratio=settings.max_growth_ratio, shares=shares,
-    )  # fmt: skip
-    on_threads(count >= SEVERAL, KERNELS.library.pointsplat_replace, task, threads=most_threads())
-    return replace(state, **after), shares[(stays.cumsum(0) - 1)[first]]
-
-
-def _as_torch() -> bool:
-    """Whether the kernel replaces some pairs as torch does."""
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **FLOATS)
-
-    factors = random(90, 3, 3)
-    state = State(
-        random(90, 3), pack(factors @ factors.mT).contiguous(), random(90), random(90, 5), random(90),
-        torch.ones(90, dtype=torch.int32, device="cpu"), torch.zeros(3, **FLOATS), 1.0,
-    )  # fmt: skip
-    first, second = torch.randperm(90, generator=generator, device="cpu")[:60].view(2, 30)
-    found = [_by_kernels(state, first, second, MERGING), replace_pairs(state, first, second, MERGING, False)]
-    ours, torchs = ([after.means, after.cov, after.alphas, after.colours, shares] for after, shares in found)
-    return all(torch.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(ours, torchs, strict=True))
-
-
-KERNELS = Kernels("merging", Path(__file__).with_name("replacement.cpp"), _as_torch)
+    """Factor of the area of Gaussians that need opacities ``alphas``, any shape; 1 up to ``max_opacity``. Two Gaussians
+    seldom need twice as much; of points without area it would be infinite."""
+    return (alphas / settings.max_opacity).clamp(1, 4.0) ** settings.growth_exponent

@@ -23,17 +23,13 @@ from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.merging.duplicates import Copies, Reduced
-from pointsplat_ns.merging.finishing import Finish, best_finish
-from pointsplat_ns.merging.groups import merged_groups
+from pointsplat_ns.merging.finishing import Finish, finished
+from pointsplat_ns.merging.groups import Groups, Tree, scene_maker
 from pointsplat_ns.merging.matching import cheapest_pairs
-from pointsplat_ns.merging.merged_scene import scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.participants import Participants, drawable
-from pointsplat_ns.merging.regrouping import areas_of, regrouped
 from pointsplat_ns.merging.replacement import replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import State, initial_state
-from pointsplat_ns.merging.tree import Tree
+from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
 from pointsplat_ns.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import FLOATS, INDICES
@@ -208,9 +204,17 @@ def _levels(
 
 
 def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings, last: bool = False) -> Merged:
-    """The result after some rounds, on a device; ``last`` as for :func:`finished`."""
+    """The result after some rounds, on a device. With ``last``, the step is not needed any more, and loses its state
+    and tree to save memory."""
+
+    def groups() -> Groups:
+        found = Groups.of(step.participants, step.state, step.tree.groups(), step.tree.shares())
+        if last:
+            del step.state, step.tree
+        return found
+
     with one_thread_each():
-        group, scene, finish = finished(step, regroup, settings, last)
+        group, scene, finish = finished(step.participants, groups(), step.reference, regroup, settings)
     assignment = torch.full((len(step.participants.scene),), -1, **INDICES)
     assignment[step.participants.members] = group
     if step.index is not None:
@@ -257,7 +261,7 @@ def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeS
         return participants.scene if whole else participants.scene[participants.members]
 
     reference = _reference(participants, viewpoints, len(participants), dense, settings)
-    state = initial_state(participants, weights, settings)
+    state = initial_state(participants, weights)
     return Step(reduced.index, participants, viewpoints, state, Tree.of_single(len(state)), reference)
 
 
@@ -282,46 +286,11 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     tree = step.tree.after_round(first, second, shares)
 
     def remaining() -> Gaussians:
-        groups = merged_groups(participants, state, tree)
-        return scene_maker(participants, groups, settings)(0.0)
+        groups = Groups.of(participants, state, tree.groups(), tree.shares())
+        return scene_maker(participants, groups, settings)[1](0.0)
 
     reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
     return replace(step, state=state, tree=tree, reference=reference)
-
-
-def finished(
-    step: Step, regroup: bool, settings: MergeSettings, last: bool = False
-) -> tuple[Tensor, Gaussians, Finish]:
-    """The group (n,) of each participant in a step, in the order of their first members, and the scene of the groups
-    with the finish that suits it.
-
-    Args:
-        step: after the last round.
-        regroup: whether members may change groups.
-        settings: of regrouping and finishing.
-        last: whether the step is not needed any more; it loses its state and tree then, to save memory.
-    """
-    participants, reference = step.participants, step.reference
-    groups = merged_groups(participants, step.state, step.tree)
-    if last:
-        del step.state, step.tree
-    give_back_freed_memory()
-    any_merged = groups.any_merged
-    if regroup and any_merged and settings.regrouping_rounds > 0:
-        group, areas, alphas = groups.group, areas_of(groups.cov), groups.alphas
-        del groups
-        groups = regrouped(participants, group, areas, alphas, settings)
-        del group
-    ordered = [groups.in_order()]
-    del groups
-    group = ordered[0].group
-    give_back_freed_memory()
-    make = scene_maker(participants, ordered.pop(), settings)  # which lets go of what it has used
-    give_back_freed_memory()
-    finish = Finish()
-    if reference is not None and any_merged:
-        finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))), settings)
-    return group, make(finish.size_change), finish
 
 
 def _reference(

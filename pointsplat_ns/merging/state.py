@@ -1,25 +1,71 @@
-"""The Gaussians that remain after some rounds, in the numbers that a round needs."""
+"""The Gaussians of a scene that are merged, and what a round knows of those that remain."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
+from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
+from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.merging.covariance import covariances_of
-from pointsplat_ns.merging.participants import Participants
-from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.views import Views
 
 
-def bounded(cov: Tensor) -> Tensor:
-    """Covariances that float32 can hold."""
-    return cov.clamp(-1e30, 1e30)
+@dataclass(frozen=True, eq=False)
+class Participants:
+    """The Gaussians that are merged, and the scene that they are part of."""
+
+    scene: Gaussians  # N Gaussians on the CPU
+    members: Tensor  # [n] int64, indices in the scene, along a space-filling curve: neighbours are near in memory
+    centre: Tensor  # [3] float64, of the scene's content
+    size: float
+    """Diagonal of the scene's content, scene units."""
+
+    @classmethod
+    def of(cls, scene: Gaussians, members: Tensor) -> Participants:
+        """The participants ``members`` (n,) of a scene on the CPU."""
+        order = curve_keys(unit_cells(scene.means[members])).argsort(stable=True)
+        return cls(scene, members[order], *content_size(scene))
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def in_units(self, scene: Gaussians) -> Gaussians:
+        """A scene in the units of this scene's content, see :func:`~pointsplat_ns.looking.content.in_units`."""
+        return in_units(scene, self.centre, self.size)
+
+    def views_in_units(self, views: Views) -> Views:
+        """Views of this scene in the same units."""
+        return views_in_units(views, self.centre, self.size)
+
+
+def drawable(scene: Gaussians, k: int) -> Tensor:
+    """Ascending indices of the Gaussians that can be drawn; if they are fewer than ``k``, also of the most opaque ones
+    that are too faint.
+
+    Raises:
+        BudgetError: if fewer than ``k`` have finite parameters.
+    """
+    usable = scene.usable()
+    if int(usable.sum()) < k:
+        raise BudgetError(f"cannot keep {k} Gaussians: {int(usable.sum())} of {len(scene)} have finite parameters")
+    chosen = usable & (scene.alphas >= ALPHA_MIN)
+    missing = k - int(chosen.sum())
+    if missing > 0:
+        faint = usable & ~chosen
+        order = torch.where(faint, scene.opacities[:, 0], -math.inf).sort(descending=True, stable=True).indices
+        chosen[order[faint[order]][:missing]] = True
+    return chosen.nonzero()[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +76,7 @@ class State:
     """
 
     means: Tensor  # [n, 3] float32, around the centre, in units of the size
-    cov: Tensor  # [n, 6] float32, in units of the squared size, see :func:`bounded`
+    cov: Tensor  # [n, 6] float32, in units of the squared size, within what float32 can hold
     alphas: Tensor  # [n] float32
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
@@ -57,8 +103,7 @@ class ColourAxes(NamedTuple):
 def initial_state(
     participants: Participants,
     weights: Tensor,
-    settings: MergeSettings,
-    axes: ColourAxes | None = None,
+    colour_axes: ColourAxes | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> State:
     """The state before the first round.
@@ -66,17 +111,19 @@ def initial_state(
     Args:
         participants: n Gaussians of a scene.
         weights: (n,) visibility weight of each per unit of area.
-        settings: ``colour_axes`` and ``max_colour``.
-        axes: of the colours; by default the principal axes of the participants.
+        colour_axes: by default the principal axes of the participants.
         dtype: float64 for a reference, which kernels do not take.
     """
     scene, members = participants.scene, participants.members
     centre, size = participants.centre.double(), participants.size
+    middle, axes = colour_axes or principal_axes(scene, members)
     return State(
         means=in_pieces(lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype),
-        cov=in_pieces(lambda rows: bounded(covariances_of(scene, rows) / size**2), members, 6, dtype=dtype),
+        cov=in_pieces(lambda rows: (covariances_of(scene, rows) / size**2).clamp(-1e30, 1e30), members, 6, dtype=dtype),
         alphas=torch.sigmoid(scene.opacities[members, 0]).to(dtype),
-        colours=_on_axes(scene, members, axes or principal_axes(scene, members, settings), settings),
+        colours=in_pieces(
+            lambda rows: (_coefficients(scene, rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32
+        ),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
         centre=centre,
@@ -84,38 +131,29 @@ def initial_state(
     )
 
 
-def bounded_colours(coefficients: Tensor, settings: MergeSettings) -> Tensor:
-    """SH coefficients in colour units, within ``max_colour``, float32."""
-    return (coefficients.float() * SH_C0).clamp_(-settings.max_colour, settings.max_colour)
+def bounded_colours(coefficients: Tensor) -> Tensor:
+    """SH coefficients in colour units, float32, within bounds: a few broken colours must not hide all others."""
+    return (coefficients.float() * SH_C0).clamp_(-10.0, 10.0)
 
 
-def _coefficients(scene: Gaussians, rows: Tensor, settings: MergeSettings) -> Tensor:
+def _coefficients(scene: Gaussians, rows: Tensor) -> Tensor:
     """All SH coefficients (m, 3 (d+1)^2) of rows (m,), in colour units."""
     parts = scene.features_dc[rows], scene.features_rest[rows].reshape(len(rows), -1)
-    return bounded_colours(torch.cat(parts, dim=1), settings)
+    return bounded_colours(torch.cat(parts, dim=1))
 
 
-def principal_axes(scene: Gaussians, members: Tensor, settings: MergeSettings) -> ColourAxes:
+def principal_axes(scene: Gaussians, members: Tensor) -> ColourAxes:
     """Principal axes of all SH coefficients of members (n,). By Parseval's theorem, the coefficients of every band
-    contribute to the mean square over directions as the constant does."""
+    contribute to the mean square over directions as the constant does. Eight axes hold nearly all of the variance."""
     pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
-    shift = _coefficients(scene, pieces[0], settings).mean(0)  # near the mean, so that float32 holds the squares
+    shift = _coefficients(scene, pieces[0]).mean(0)  # near the mean, so that float32 holds the squares
     total, products = torch.zeros(width, **DOUBLES), torch.zeros(width, width, **DOUBLES)
     for rows in pieces:
-        values = _coefficients(scene, rows, settings) - shift
+        values = _coefficients(scene, rows) - shift
         total += values.sum(0)
         products += values.T @ values
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
-    axes = torch.linalg.eigh(covariance).eigenvectors[:, -settings.colour_axes :].float()
+    axes = torch.linalg.eigh(covariance).eigenvectors[:, -8:].float()
     return ColourAxes((shift + mean).float(), axes)
-
-
-def _on_axes(scene: Gaussians, members: Tensor, axes: ColourAxes, settings: MergeSettings) -> Tensor:
-    """Colours (n, C) of members (n,) on axes, around their middle."""
-
-    def on_axes(rows: Tensor) -> Tensor:
-        return (_coefficients(scene, rows, settings) - axes.middle) @ axes.axes
-
-    return in_pieces(on_axes, members, axes.axes.shape[1], dtype=torch.float32)

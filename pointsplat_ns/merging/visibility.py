@@ -25,8 +25,8 @@ from pointsplat_ns.looking.content import every_nth
 from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.traces import trace_factors
-from pointsplat_ns.merging.participants import Participants
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
+from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
@@ -53,20 +53,20 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
         scene: N Gaussians on the CPU.
         rows: (n,) indices, n at least 1.
         views: of the scene, in its own unit.
-        settings: ``visibility_views``, ``visibility_side``, ``well_seen_quantile`` and ``min_visibility``.
+        settings: ``visibility_views`` and ``min_visibility``.
 
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
     """
     covered = torch.zeros(len(scene), **DOUBLES)
-    small = views.spread(settings.visibility_views).resized(settings.visibility_side)
+    small = views.spread(settings.visibility_views).resized(112)
     small = replace(small, rasterize_mode="antialiased")
     for pixels in each_view(scene, small, pixels_of):
         covered += pixels
     stds = scene.stds[rows].double().sort(dim=1).values
     area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)
     ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
-    well_seen = ratios.sort().values[int(settings.well_seen_quantile * (len(ratios) - 1))]
+    well_seen = ratios.sort().values[int(0.9 * (len(ratios) - 1))]
     if not 0 < float(well_seen) < math.inf:
         return torch.ones(len(ratios), **FLOATS)
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()

@@ -1,21 +1,28 @@
-"""Configuration of the refiner.
-
-One dataclass holds all settings of the network. There are three presets: ``full`` (the published one, for a GPU),
-``small`` and ``tiny`` (for a CPU).
-"""
+"""Configuration of the refiner: all settings of the network, and three presets."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
+import reprlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE
 
-FINE_BITS = 16
-"""Bits per axis of the finest position code. Every grid of the network is coarser."""
+_NAMES = {
+    "encoder": ("dual", "concat"),
+    "norm": ("scene", "batch", "layer"),
+    "curves": ("z", "z-trans", "hilbert", "hilbert-trans"),
+}
+
+_RANGES = {
+    "sh_degree": (0, MAX_SH_DEGREE),
+    "grid": (1, 512),
+    "head_depth": (2, 1 << 16),
+    "means_reach": (0.0, 1e3),
+    "drop_path": (0.0, 0.99),
+}
 
 
 class RefinerConfigError(PointSplatError, ValueError):
@@ -26,9 +33,9 @@ class RefinerConfigError(PointSplatError, ValueError):
 class RefinerConfig:
     """All settings of a refiner's network.
 
-    The defaults are the sizes of the preset ``full``. Tuples of the encoder have one entry per stage; ``strides`` and
-    the tuples of the decoder have one entry fewer, finest first. Raises RefinerConfigError if the fields contradict one
-    another.
+    The defaults are the preset ``full``, the published network. Tuples of the encoder have one entry per stage;
+    ``strides`` and the tuples of the decoder have one entry fewer, finest first. Raises RefinerConfigError if the
+    fields contradict one another.
     """
 
     sh_degree: int = MAX_SH_DEGREE
@@ -87,44 +94,30 @@ class RefinerConfig:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, list):
-                setattr(self, field.name, tuple(value))
-        self._validate()
-
-    def _validate(self) -> None:
-        for field in dataclasses.fields(self):
-            _check_type(field.name, str(field.type), getattr(self, field.name))
+            value = tuple(value) if isinstance(value, list) else value
+            setattr(self, field.name, value)
+            _check_type(field.name, str(field.type), value)
         stages = len(self.enc_channels)
-        sizes = {"enc_depths": stages, "enc_heads": stages, "strides": stages - 1}
-        sizes.update({"dec_channels": stages - 1, "dec_depths": stages - 1, "dec_heads": stages - 1})
         _require(stages >= 1, "enc_channels is empty; expected one entry per stage")
-        for name, size in sizes.items():
-            entries = len(getattr(self, name))
+        for name in ("enc_depths", "enc_heads", "strides", "dec_channels", "dec_depths", "dec_heads"):
+            entries, size = len(getattr(self, name)), stages if name.startswith("enc") else stages - 1
             _require(entries == size, f"{name} has {entries} entries; expected {size} for {stages} encoder stages")
         for part in ("enc", "dec"):
-            channels, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
-            for c, h in zip(channels, heads, strict=True):
+            for c, h in zip(getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads"), strict=True):
                 _require(c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
         for s in self.strides:
             _require(s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
-        curves = ("z", "z-trans", "hilbert", "hilbert-trans")
-        known = bool(self.curves) and all(curve in curves for curve in self.curves)
-        _require(known, f"curves is {self.curves}; expected names out of {', '.join(curves)}")
-        _require(0 <= self.sh_degree <= MAX_SH_DEGREE, f"sh_degree is {self.sh_degree}; expected 0 to {MAX_SH_DEGREE}")
-        _require(self.encoder in ("dual", "concat"), f"encoder is {self.encoder!r}; expected 'dual' or 'concat'")
+        for name, known in _NAMES.items():
+            value = getattr(self, name)
+            fits = bool(value) and set(value if isinstance(value, tuple) else [value]) <= set(known)
+            _require(fits, f"{name} is {value!r}; expected {', '.join(known)}")
         _require(
             self.encoder == "dual" or (self.use_appearance and self.use_position),
             "use_appearance and use_position are switches of the encoder 'dual'; encoder 'concat' expects both on",
         )
-        norms = ("scene", "batch", "layer")
-        _require(self.norm in norms, f"norm is {self.norm!r}; expected one of {', '.join(norms)}")
-        _require(self.grid is None or 1 <= self.grid <= 512, f"grid is {self.grid}; expected 1 to 512, or None")
-        _require(self.head_depth >= 2, f"head_depth is {self.head_depth}; expected at least 2")
-        _require(self.patch >= 1, f"patch is {self.patch}; expected at least 1")
-        _require(
-            0 <= self.means_reach < math.inf, f"means_reach is {self.means_reach}; expected a finite number from 0"
-        )
-        _require(0 <= self.drop_path < 1, f"drop_path is {self.drop_path}; expected 0 to 1")
+        for name, (least, most) in _RANGES.items():
+            value = getattr(self, name)
+            _require(value is None or least <= value <= most, f"{name} is {value}; expected {least} to {most}")
 
     @property
     def num_rest(self) -> int:
@@ -141,14 +134,9 @@ class RefinerConfig:
         """Channels per Gaussian that leave the backbone."""
         return self.dec_channels[0] if self.dec_channels else self.enc_channels[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """All fields, JSON-ready."""
-        return dataclasses.asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RefinerConfig:
-        """The inverse of :meth:`to_dict`. Raises RefinerConfigError if a field is unknown or the fields contradict one
-        another."""
+        """The configuration of a file. Raises RefinerConfigError if a field is unknown or fields contradict others."""
         fields = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - fields)
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")
@@ -174,14 +162,9 @@ def _check_type(name: str, kind: str, value: Any) -> None:
         whole = isinstance(numbers, tuple) and all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
         _require(
             whole and all(least <= n <= most for n in numbers),
-            f"{name} is {_short(value)}; expected {'whole numbers' if kind != 'int' else 'a whole number'} of "
+            f"{name} is {reprlib.repr(value)}; expected {'whole numbers' if kind != 'int' else 'a whole number'} of "
             f"{least} to {most}",
         )
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _require(condition: bool, message: str) -> None:

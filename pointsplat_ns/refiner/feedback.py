@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io.files import write_tensors
-from pointsplat_ns.refiner.layers import Linear
+from pointsplat_ns.refiner.network import linear, zero_linear
 from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
 FEEDBACK_FORMAT = "pointsplat-feedback/2"
@@ -45,15 +45,9 @@ class FeedbackRefiner(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         with torch.device("cpu"):
-            layers: list[nn.Module] = []
-            width = self.FEATURES
-            for _ in range(2):
-                layers += [Linear(width, 64), nn.SiLU()]
-                width = 64
-            last = Linear(width, len(PARAMETERS))
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
-            self.mlp = nn.Sequential(*layers, last)
+            self.mlp = nn.Sequential(
+                linear(self.FEATURES, 64), nn.SiLU(), linear(64, 64), nn.SiLU(), zero_linear(64, len(PARAMETERS))
+            )
 
     def forward(self, features: Tensor) -> Tensor:
         """Factors of the steps, (N, 6), above 0, in the order of :data:`~pointsplat_ns.gaussians.PARAMETERS`, from

@@ -11,12 +11,9 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import zero_as_identity
 from pointsplat_ns.refiner.config import RefinerConfig
-from pointsplat_ns.refiner.encoder import make_encoder
-from pointsplat_ns.refiner.heads import ResidualHeads
-from pointsplat_ns.refiner.normalize import Features, gaussian_features
-from pointsplat_ns.refiner.point_transformer import PointTransformer
+from pointsplat_ns.refiner.network import ConcatEncoder, DualBranchEncoder, Features, PointTransformer, ResidualHeads
 from pointsplat_ns.refiner.sparse_ops import permute
-from pointsplat_ns.refiner.structure import Structure, build_structure, structure_key
+from pointsplat_ns.refiner.structure import Structure, UnitCube, build_structure, structure_key
 
 
 class Refiner(nn.Module):
@@ -47,7 +44,7 @@ class Refiner(nn.Module):
         super().__init__()
         self.config = config
         with torch.device(device):
-            self.encoder = make_encoder(config)
+            self.encoder = DualBranchEncoder(config) if config.encoder == "dual" else ConcatEncoder()
             self.backbone = PointTransformer(config.encoded_dim, config)
             self.heads = ResidualHeads(config.backbone_dim + config.encoded_dim, config)
 
@@ -95,14 +92,15 @@ class Refiner(nn.Module):
     def _refine(self, scene: Gaussians, structure: Structure) -> Gaussians:
         """The refined scene of usable Gaussians."""
         features = gaussian_features(scene, structure.cube, self.config.num_rest, self.dtype)
-        refined = self._add(scene, self.residuals(features, structure), features, structure)
+        refined = _moved(scene, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
         if self.training or (sound := refined.usable()).all():
             return refined
         return _put_back(refined[sound], sound, scene)
 
     def residuals(self, features: Features, structure: Structure) -> dict[str, Tensor]:
         """Residuals by attribute, in the network's units and the scene's order. # {name: [N, size]}"""
-        encoded = self.encoder(features.permute(structure.order, structure.inverse))
+        in_memory = {name: permute(value, structure.order, structure.inverse) for name, value in vars(features).items()}
+        encoded = self.encoder(Features(**in_memory))
         residuals = self.heads(torch.cat([self.backbone(encoded, structure), encoded], dim=1))
         return {name: permute(value, structure.inverse, structure.order) for name, value in residuals.items()}
 
@@ -117,23 +115,16 @@ class Refiner(nn.Module):
         """Floating type of the network."""
         return next(self.parameters()).dtype
 
-    def _add(
-        self, scene: Gaussians, residuals: dict[str, Tensor], features: Features, structure: Structure
-    ) -> Gaussians:
-        moved = (residuals["means"].double() * structure.cube.extent).to(scene.dtype)
-        turned = residuals["quats"].to(scene.dtype) * features.quat_scale
-        rest = scene.features_rest
-        if "features_rest" in residuals:
-            wanted = residuals["features_rest"].view(len(scene), -1, 3)[:, : rest.shape[1]]
-            rest = rest + wanted.to(scene.dtype)
-        return scene.replace(
-            means=scene.means + moved,
-            scales=scene.scales + residuals["scales"].to(scene.dtype),
-            quats=zero_as_identity(scene.quats) + turned,
-            opacities=scene.opacities + residuals["opacities"].to(scene.dtype),
-            features_dc=scene.features_dc + residuals["features_dc"].to(scene.dtype),
-            features_rest=rest,
-        )
+
+def _moved(scene: Gaussians, residuals: dict[str, Tensor], quat_scale: Tensor, extent: Tensor) -> Gaussians:
+    """A scene with residuals in the network's units added."""
+    steps = {name: residual.to(scene.dtype) for name, residual in residuals.items() if name != "means"}
+    steps["means"] = (residuals["means"].double() * extent).to(scene.dtype)
+    steps["quats"] = steps["quats"] * quat_scale
+    if "features_rest" in steps:
+        steps["features_rest"] = steps["features_rest"].view(len(scene), -1, 3)[:, : scene.features_rest.shape[1]]
+    start = scene.replace(quats=zero_as_identity(scene.quats))
+    return scene.replace(**{name: getattr(start, name) + step for name, step in steps.items()})
 
 
 def _put_back(rows: Gaussians, mask: Tensor, scene: Gaussians) -> Gaussians:
@@ -141,3 +132,47 @@ def _put_back(rows: Gaussians, mask: Tensor, scene: Gaussians) -> Gaussians:
     place = mask.nonzero()[:, 0]
     values = zip(scene.items(), rows.tensors(), strict=True)
     return scene.replace(**{name: before.index_copy(0, place, after) for (name, before), after in values})
+
+
+def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: torch.dtype) -> Features:
+    """Network input of a scene of N usable Gaussians, with its unit cube, for so many SH coefficients of degree 1 and
+    higher a colour channel, in the network's floating type.
+
+    Positions are centred and divided by one extent, which keeps the aspect ratio; log-scales are shifted by the
+    logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
+    residuals are added to the original parameters. Trained weights depend on these units and limits.
+    """
+    # -5 is a typical log-scale in the unit cube: 4 cm in a room of 6 m
+    log_scales = (cube.log_scales(scene.scales) - -5.0) / 2.0
+    logits = scene.opacities.clamp(-12.0, 12.0) / 4.0  # beyond 12, opacity is 0 or 1 within 1e-5
+    sh_limit = 8.0  # displayable colours need at most 1.8
+    quats, quat_scale = canonical_quats(scene.quats)
+    rest = scene.features_rest.flatten(1).clamp(-sh_limit, sh_limit).to(dtype)
+    return Features(
+        positions=cube.positions(scene.means).to(dtype),
+        quats=quats.to(dtype),
+        scales=log_scales.clamp(-6.0, 6.0).to(dtype),
+        opacities=logits.to(dtype),
+        features_dc=scene.features_dc.clamp(-sh_limit, sh_limit).to(dtype),
+        features_rest=torch.nn.functional.pad(rest, (0, 3 * num_rest - rest.shape[1])),
+        quat_scale=quat_scale,
+    )
+
+
+def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit quaternions (N, 4) of one sign, and their signed lengths (N, 1), of finite wxyz of any length.
+
+    A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
+    Quaternions shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of
+    1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
+    overflow.
+    """
+    quats = zero_as_identity(quats)
+    largest = quats.abs().amax(dim=1, keepdim=True).detach()
+    scaled = quats / largest
+    length = scaled.norm(dim=1, keepdim=True)
+    first = (scaled != 0).to(torch.uint8).argmax(dim=1, keepdim=True)
+    sign = torch.where(scaled.gather(1, first) < 0, -1.0, 1.0).to(quats.dtype)
+    top = torch.finfo(quats.dtype).max
+    signed = (sign * length * largest).clamp(-top, top)
+    return scaled * sign / length, signed

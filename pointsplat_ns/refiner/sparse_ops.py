@@ -13,6 +13,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+Order = tuple[Tensor, Tensor]
+"""The order of points along a curve and its inverse, (N,) int64 each."""
+
 KernelMap = list[tuple[Tensor, Tensor]]
 """Pairs of neighbouring cells, from ``structure.neighbour_pairs``: for each offset in one half of the kernel, the cells
 (i, j) with j at i + offset, (P,) int64 each."""
@@ -150,3 +153,22 @@ def by_rows(
     for start in range(rows, len(x), rows):
         out[start : start + rows] = function(x[start : start + rows])
     return out
+
+
+def by_patches(
+    function: Callable[[Tensor], Tensor],  # [P * K, C] -> [P * K, C], each patch by itself
+    x: Tensor,  # [N, C]
+    width: int,  # columns of the widest tensor within the function
+    patch: int = 1,
+    order: Order | None = None,  # None: the order in memory
+) -> Tensor:
+    """``function(x)``. # [N, C]"""
+    patch = max(1, min(patch, len(x)))
+    full = len(x) // patch * patch  # points in whole patches
+    if order is not None:
+        x = permute(x, *order)
+    whole = x if full == len(x) else x[:full]  # a slice of everything would cost a copy in the backward pass
+    out = by_rows(function, whole, rows_at_a_time(width, patch))
+    if full < len(x):
+        out = torch.cat([out, function(x[len(x) - patch :])[full - len(x) :]])
+    return out if order is None else permute(out, order[1], order[0])

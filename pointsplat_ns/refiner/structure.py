@@ -1,39 +1,109 @@
-"""Neighbour tables and curve orders of a scene, from positions alone: built once, used at every step.
+"""Where the Gaussians of a scene are: its unit cube, and the grids and curves by which the network finds neighbours.
 
-Points are stored along the first curve of the configuration, so that the points of a cell are consecutive at every
-level, and neighbours are close in memory.
+All of it follows from positions alone. It is built once for a scene and used at every step. Points are stored along the
+first curve of the configuration, so that the points of a cell are consecutive at every level, and neighbours are close
+in memory.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.refiner.config import FINE_BITS, RefinerConfig
-from pointsplat_ns.refiner.normalize import UnitCube, unit_cube
-from pointsplat_ns.refiner.serialization import curve_codes
+from pointsplat_ns.geometry.transforms import interleave, spread_bits
+from pointsplat_ns.refiner.config import RefinerConfig
+from pointsplat_ns.refiner.sparse_ops import KernelMap, Order
+
+FINE_BITS = 16
+"""Bits per axis of the finest position code. Every grid of the network is coarser."""
 
 
 @dataclass(frozen=True)
-class StructureSettings:
-    """Settings of grids and neighbour tables."""
+class UnitCube:
+    """A cube in scene units; all fields in float64."""
 
-    fixed_grid_bits: int = 7
-    """Bits per axis by which the finest code splits the cells of a fixed grid: a grid of 512 needs 16 bits in all."""
-    occupancy: float = 0.6
-    """Least number of occupied cells per distinct position in an adapted grid, which is the coarsest such grid: one or
-    two points share a cell, and neighbours are in adjacent cells."""
-    table_per_cell: int = 128
-    """Largest number of entries (4 bytes each) per occupied cell in a table of the whole grid, which finds neighbours.
-    Larger grids are searched, which is three to eight times slower."""
-    table_limit: int = 2**26
-    """Largest number of entries of that table: 256 MB."""
+    centre: Tensor  # [3] scene units
+    extent: Tensor  # [] side of the cube, scene units, above 0
+
+    def positions(self, means: Tensor) -> Tensor:
+        """Positions in [-0.5, 0.5], float64; those outside the cube are clamped to it. # [N, 3]"""
+        return ((means.double() - self.centre) / self.extent).clamp(-0.5, 0.5)
+
+    def log_scales(self, scales: Tensor) -> Tensor:
+        """Log-scales in units of the cube, in float64. # [N, 3]"""
+        return scales.double() - self.extent.log()
 
 
-STRUCTURE = StructureSettings()
+def unit_cube(means: Tensor) -> UnitCube:
+    """The unit cube of at least one finite position (N, 3), scene units.
+
+    The core of the scene is the box of its positions without the outermost 1 % at each end of each axis (at least one
+    position, from 8 positions on). The box of all positions is cut to the core plus half of the core's longest side in
+    each direction. A scene without outliers keeps its full extent; an outlier at most doubles it. The cube has the
+    centre and the longest side of the cut box, or side 1 where that is zero.
+    """
+    axes = means.detach().T.contiguous()  # [3, N]
+    n = axes.shape[1]
+    trim = max(1, math.ceil(0.01 * n)) if n >= 8 else 0
+    low, high = (value.double() for value in axes.aminmax(dim=1))
+    core_low, core_high = (axes.kthvalue(k, dim=1).values.double() for k in (trim + 1, n - trim))
+    reach = 0.5 * (core_high - core_low).max()
+    if reach > 0:
+        low, high = torch.maximum(low, core_low - reach), torch.minimum(high, core_high + reach)
+    extent = (high - low).max()
+    return UnitCube(low + (high - low) / 2, torch.where(extent > 0, extent, torch.ones_like(extent)))
+
+
+def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor]:
+    """Codes (N,) in ``[0, 8**bits)`` along each named space-filling curve, int64.
+
+    Points that are close along a curve are close in space, so a patch of consecutive points is a neighbourhood. The
+    code of a coarser cell is the code of any of its points without the last three bits per halving, so one sort serves
+    all grids of the network.
+
+    Args:
+        coords: integer coordinates, each at least 0 and below ``2**bits``.  # [N, 3] int64
+        bits: bits per axis, at most 20.
+        curves: ``z`` for the z-order (Morton) curve, which interleaves the bits of the three axes; ``hilbert`` for the
+            Hilbert curve, whose consecutive cells always share a face; or either with ``-trans``: the same curve with x
+            and y exchanged.
+    """
+    codes = []
+    for curve in curves:
+        axes = coords[:, [1, 0, 2]] if curve.endswith("-trans") else coords
+        x, y, z = _gray_axes(axes, bits) if curve.startswith("hilbert") else axes.unbind(1)
+        codes.append(interleave(*map(spread_bits, (x, y, z))))
+    return codes
+
+
+def _gray_axes(coords: Tensor, bits: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Three numbers (N,) each, whose interleaved bits are the Hilbert codes of coordinates (N, 3).
+
+    At each bit, a mirror or an exchange of axes applies to all lower bits. Then the bits are Gray-coded. Source: J.
+    Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707 (2004).
+    """
+    axes = list(coords.unbind(1))
+    for bit in range(bits - 1, 0, -1):
+        low = (1 << bit) - 1
+        for i in range(3):
+            mirrored = -(axes[i] >> bit & 1)  # all bits set, or none
+            exchanged = (axes[0] ^ axes[i]) & low & ~mirrored
+            axes[i] = axes[i] ^ exchanged
+            axes[0] = axes[0] ^ (exchanged | (mirrored & low))
+    x = axes[0]
+    y = axes[1] ^ x
+    z = axes[2] ^ y
+    parity = torch.zeros_like(z)
+    for bit in range(bits - 1, 0, -1):
+        parity ^= -(z >> bit & 1) & ((1 << bit) - 1)
+    return x ^ parity, y ^ parity, z ^ parity
+
 
 HALF_KERNEL = [
     (dx, dy, dz)
@@ -52,8 +122,8 @@ class GridLevel:
     size: int
     cell_of: Tensor | None  # [M] cell of each point; None where each point has its own
     num_cells: int
-    neighbours: list[tuple[Tensor, Tensor]]  # per offset of HALF_KERNEL: cells (i, j) with j at i + offset
-    orders: list[tuple[Tensor, Tensor] | None]  # per curve: order and its inverse, [M] each; None: memory order
+    neighbours: KernelMap  # per offset of HALF_KERNEL: cells (i, j) with j at i + offset
+    orders: list[Order | None]  # per curve; None: memory order
     cluster: Tensor | None  # [M] cell of the next level, non-decreasing; None at the last level
 
 
@@ -87,16 +157,19 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
     not depend on the order of the Gaussians.
     """
     cube = unit_cube(scene.means)
-    units = 2**FINE_BITS if config.grid is None else config.grid << STRUCTURE.fixed_grid_bits
+    fixed_bits = 7  # per axis, by which the finest code splits a cell of a fixed grid: a grid of 512 needs 16 in all
+    units = 2**FINE_BITS if config.grid is None else config.grid << fixed_bits
     fine = ((cube.positions(scene.means) + 0.5) * units).long().clamp_(0, units - 1)
     codes = curve_codes(fine, FINE_BITS, config.curves)
     order, depths = _canonical_order(scene, codes[0])
-    shift = STRUCTURE.fixed_grid_bits if config.grid is not None else _adaptive_shift(depths)
+    shift = _adaptive_shift(depths) if config.grid is None else fixed_bits
 
     levels = []
-    shifts = [min(shift + _log2_product(config.strides[:i]), FINE_BITS) for i in range(len(config.strides) + 1)]
+    halvings = [0, *itertools.accumulate(stride.bit_length() - 1 for stride in config.strides)]
+    shifts = [min(shift + count, FINE_BITS) for count in halvings]
     first = order  # in the scene, a representative point of each point of the level
-    orders = [_argsort_pair(code.index_select(0, order)) for code in codes[1:]]
+    along = [code.index_select(0, order).argsort(stable=True) for code in codes[1:]]
+    orders = [(one, _invert(one)) for one in along]
     for i, s in enumerate(shifts):
         cell_of, cell_first = _runs(depths, s)
         cells = fine.index_select(0, first.index_select(0, cell_first)) >> s
@@ -113,11 +186,11 @@ def build_structure(scene: Gaussians, config: RefinerConfig) -> Structure:
         )
         if cluster is not None and next_first is not None:
             first, depths = first.index_select(0, next_first), depths.index_select(0, next_first)
-            orders = [_coarser_pair(along, cluster, len(first)) for along, _ in orders]
+            orders = [_coarser_order(one, cluster) for one, _ in orders]
     return Structure(cube, order, _invert(order), levels, structure_key(config))
 
 
-def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
+def neighbour_pairs(cells: Tensor) -> KernelMap:
     """Existing neighbours of distinct cells in the 3x3x3 kernel, of integer coordinates (M, 3) from 0 to 2^20, at least
     one.
 
@@ -125,34 +198,11 @@ def neighbour_pairs(cells: Tensor) -> list[tuple[Tensor, Tensor]]:
         per offset of :data:`HALF_KERNEL`, the indices ``i`` and ``j`` of all pairs with
         ``cells[j] == cells[i] + offset``, ``i`` increasing.  # [P], [P] int64
     """
-    m = len(cells)
-    side = int(cells.max()) + 3  # two empty cells after the last along each axis, so that no offset wraps around
+    m, side = len(cells), int(cells.max()) + 3  # two empty cells after the last of each axis: no offset wraps around
     keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
-    if side**3 <= min(STRUCTURE.table_per_cell * m, STRUCTURE.table_limit):
-        numbered, j = _look_up(keys, side)
-    else:
-        numbered, j = _search(keys, side)
-    counts = torch.bincount(numbered // m, minlength=len(HALF_KERNEL)).tolist()
-    return list(zip((numbered % m).split(counts), j.split(counts), strict=True))
-
-
-def _look_up(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Pairs from a table of the whole grid: index of the offset times M plus i, increasing, and j. # [P], [P]"""
-    table = torch.zeros(side**3, dtype=torch.int32, device=keys.device)
-    table[keys] = torch.arange(1, len(keys) + 1, dtype=torch.int32, device=keys.device)
-    steps = [[(dx * side + dy) * side + dz] for dx, dy, dz in HALF_KERNEL]
-    target = keys.to(torch.int32) + torch.tensor(steps, dtype=torch.int32, device=keys.device)
-    partner = table.index_select(0, target.flatten())
-    numbered = partner.nonzero()[:, 0]
-    return numbered, partner.index_select(0, numbered).long() - 1
-
-
-def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """The same pairs by search among the sorted keys, for grids of any size. # [P], [P]"""
-    m = len(keys)
     keys, index = keys.to(torch.int32 if side**3 < 2**31 else torch.int64).sort()  # half the width takes half the time
     following = (keys[1:] == keys[:-1] + 1).nonzero()[:, 0]  # offset (0, 0, 1)
-    found = [index.index_select(0, following)]
+    found = [index.index_select(0, following)]  # index of the offset times M, plus i
     partners = [index.index_select(0, following + 1)]
     # The three cells of another column (dx, dy) are consecutive in the sorted keys, so one search finds them all. Its
     # targets are sorted too, which halves its time.
@@ -167,8 +217,10 @@ def _search(keys: Tensor, side: int) -> tuple[Tensor, Tensor]:
         found.append(numbered.index_select(0, at).add_(dz * m))
         partners.append(index.index_select(0, place.index_select(0, at)))
         place, target = place.add_(hit), target.add_(1)
-    in_memory, order = torch.cat(found).sort()
-    return in_memory, torch.cat(partners).index_select(0, order)
+    numbered, order = torch.cat(found).sort()
+    j = torch.cat(partners).index_select(0, order)
+    counts = torch.bincount(numbered // m, minlength=len(HALF_KERNEL)).tolist()
+    return list(zip((numbered % m).split(counts), j.split(counts), strict=True))
 
 
 def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
@@ -193,10 +245,11 @@ def _canonical_order(scene: Gaussians, codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _adaptive_shift(depths: Tensor) -> int:
-    """Bits per axis to drop from the finest codes, so that one or two positions share a cell."""
+    """Bits per axis to drop from the finest codes, as many as possible with one or two positions in a cell, so that
+    neighbours are in adjacent cells."""
     cells = torch.bincount(depths, minlength=65).flip(0).cumsum(0).flip(0).tolist()  # of at least that many bits
     for shift in range(FINE_BITS, 0, -1):
-        if cells[3 * shift + 1] >= STRUCTURE.occupancy * cells[1]:
+        if cells[3 * shift + 1] >= 0.6 * cells[1]:  # occupied cells per distinct position
             return shift
     return 0
 
@@ -207,8 +260,8 @@ def _runs(depths: Tensor, shift: int) -> tuple[Tensor, Tensor]:
     return starts.cumsum(0) - 1, starts.nonzero()[:, 0]
 
 
-def _coarser_pair(along: Tensor, cluster: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Order of the next level and its inverse. A curve visits all points of a cell in a row, so it visits the cells in
+def _coarser_order(along: Tensor, cluster: Tensor) -> Order:
+    """The order of the next level. A curve visits all points of a cell in a row, so it visits the cells in
     the order of their first points."""
     cells = cluster.index_select(0, along)
     starts = torch.ones_like(cells, dtype=torch.bool)
@@ -217,14 +270,5 @@ def _coarser_pair(along: Tensor, cluster: Tensor, size: int) -> tuple[Tensor, Te
     return order, _invert(order)
 
 
-def _argsort_pair(codes: Tensor) -> tuple[Tensor, Tensor]:
-    order = codes.argsort(stable=True)
-    return order, _invert(order)
-
-
 def _invert(order: Tensor) -> Tensor:
     return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device, dtype=torch.int64))
-
-
-def _log2_product(strides: tuple[int, ...]) -> int:
-    return sum(s.bit_length() - 1 for s in strides)

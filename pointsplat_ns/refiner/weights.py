@@ -30,7 +30,7 @@ def save_refiner(refiner: Refiner, path: str | Path, metadata: dict[str, Any] | 
     JSON can hold: data, command, steps, results."""
     header = {
         "format": REFINER_FORMAT,
-        "config": json.dumps(refiner.config.to_dict()),
+        "config": json.dumps(vars(refiner.config)),
         "metadata": json.dumps(metadata or {}),
     }
     write_tensors(path, refiner.state_dict(), header)

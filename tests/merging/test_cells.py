@@ -20,8 +20,8 @@ from pointsplat_ns.io.ply_writing import header_bytes, row_table
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.merging import MERGING, MergeSettings, merge
-from pointsplat_ns.merging.cells import Scratch, merge_file
-from pointsplat_ns.merging.cells.partition import divided
+from pointsplat_ns.merging.by_cells import merge_file
+from pointsplat_ns.merging.cells import Scratch, divided
 from pointsplat_ns.system.memory import PeakMemory
 
 
@@ -113,7 +113,8 @@ from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.merging import MERGING
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.merging.cells import Scratch, merge_file
+from pointsplat_ns.merging.by_cells import merge_file
+from pointsplat_ns.merging.cells import Scratch
 here = Path(sys.argv[1])
 for at in (4, 9, 0):  # as often as it is killed, it is started again
     assert not (here / "small.ply").exists()
@@ -179,17 +180,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.merging.cells import Scratch, merge_file, partition
+from pointsplat_ns.merging import cells
+from pointsplat_ns.merging.by_cells import merge_file
 from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.system.memory import PeakMemory
-partition.CELLS = partition.CellSettings(rows_at_once=1 << 13, overview=1 << 12)
+cells.ROWS_AT_ONCE, cells.OVERVIEW = 1 << 13, 1 << 12
 peaks = []
 for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for imports and kernels
     folder, peak = Path(sys.argv[1]) / name, PeakMemory()
     peaks.append(peak.bytes())
     rows = PlyRows.open(folder / "scene.ply")
     blind = replace(MERGING, min_count_rendered=10**9)
-    merge_file(rows, lambda n: n // 10, folder / "small.ply", most, Scratch(folder / "cells", {}), settings=blind)
+    merge_file(rows, lambda n: n // 10, folder / "small.ply", most, cells.Scratch(folder / "cells", {}), settings=blind)
     peaks.append(peak.bytes())
 print(peaks[3] - peaks[2])
 """

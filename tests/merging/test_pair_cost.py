@@ -19,15 +19,8 @@ from pointsplat_ns.merging.covariance import (
     projected_area,
     rms_area,
 )
-from pointsplat_ns.merging.pair_cost import KERNELS, costs_in_plane, pair_costs
-from pointsplat_ns.merging.participants import Participants
-from pointsplat_ns.merging.projections import (
-    DIRECTIONS,
-    PLANE_AXES,
-    TO_PLANE,
-    Projections,
-)
-from pointsplat_ns.merging.state import State, initial_state
+from pointsplat_ns.merging.pair_cost import DIRECTIONS, KERNELS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
+from pointsplat_ns.merging.state import Participants, State, initial_state
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
@@ -38,7 +31,7 @@ def state_of(scene: Gaussians, size: float = 1.0) -> State:
     """The state before the first round, of all Gaussians, around the origin."""
     n = len(scene)
     participants = Participants(scene, torch.arange(n), torch.zeros(3, dtype=torch.float64), size)
-    return initial_state(participants, torch.ones(n), MERGING)
+    return initial_state(participants, torch.ones(n))
 
 
 def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians:
@@ -54,20 +47,12 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
     )
 
 
-def costs_along(
-    state: State, direction: int, i: torch.Tensor, j: torch.Tensor, dtype: torch.dtype = torch.float32
-) -> torch.Tensor:
-    """Costs (m, k) in one direction, float64."""
-    projections = Projections.empty(state, dtype)
-    projections.fill(state, torch.arange(len(state)), direction)
-    return costs_in_plane(projections, i, j, MERGING).double()
-
-
 def cost_along_z(scene: Gaussians) -> float:
     """The cost of merging the first of two Gaussians with the second, along the z axis."""
     direction = int(DIRECTIONS[:, 2].abs().argmax())
     assert float(DIRECTIONS[direction, 2].abs()) == 1.0
-    return float(costs_along(state_of(scene), direction, torch.tensor([0]), torch.tensor([[1]])))
+    plane, i, j = torch.tensor([direction]), torch.tensor([0]), torch.tensor([[1]])
+    return float(costs_in_plane(state_of(scene), i, j, plane, MERGING, torch.float32))
 
 
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
@@ -96,9 +81,7 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     alpha = (alphas * areas).sum() - alphas[0] * alphas[1] * both
     alpha = alpha / torch.linalg.det(merged_cov).sqrt()
     assert (float(alpha) > MERGING.max_opacity) == grows
-    merged_cov = (
-        merged_cov * (alpha / MERGING.max_opacity).clamp(1, MERGING.max_growth_ratio) ** MERGING.growth_exponent
-    )
+    merged_cov = merged_cov * (alpha / MERGING.max_opacity).clamp(1, 4) ** MERGING.growth_exponent
     alpha = alpha.clamp_max(MERGING.max_opacity)
     merged = splat(mean, merged_cov)
     on = alphas[1] * both / areas[0]
@@ -106,12 +89,12 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     colours = scene.features_dc.double() * SH_C0
     around = (alphas[0] / 2 * colours[0] + on * colours[1]) / cover
     f = colours - around
-    assumed = 3 * MERGING.min_contrast**2
+    assumed = 3 * 0.01**2
     parts = torch.stack([alphas[0] * first, alphas[1] * second, -alpha * merged])
     change = torch.einsum("cij,cd->ijd", parts, torch.cat([f, (w[:, None] * f).sum(0)[None]]))
     shape = parts.sum(0).square().sum() * pixel
     blend = float(change.square().sum() * pixel + assumed * shape)
-    through = 3 * MERGING.background_contrast**2 * math.exp(-4 * float(cover))
+    through = 3 * 0.3**2 * math.exp(-4 * float(cover))
     area_growth = float(torch.linalg.det(merged_cov).sqrt() / areas.sum())
     want = area_growth**2 * (blend / max(float(cover), 0.5) ** 2 + through * float(shape))
     assert got == pytest.approx(want, rel=2e-3)  # float32, where six terms nearly cancel
@@ -147,8 +130,7 @@ def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
 
 
 @needs_compiler
-@pytest.mark.parametrize("k", [1, 6, 8, 9, 30])
-@pytest.mark.parametrize("axes", [1, 3, 8])
+@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3), (9, 3), (30, 8)])
 def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
     """Gaussians of a splat's proportions, some of them opaque, so that replacements grow. A cost is the difference of
     larger numbers, so the error of either is a share of the larger ones of a Gaussian's costs."""
@@ -162,9 +144,9 @@ def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
         features_dc=torch.randn(n, 3, generator=g),
         features_rest=torch.randn(n, 3, 3, generator=g),
     )
-    n_axes = replace(MERGING, colour_axes=axes)
     participants = Participants(scene, torch.arange(n), torch.full((3,), 0.5, dtype=torch.float64), 1.7)
-    state = initial_state(participants, torch.rand(n, generator=g), n_axes)
+    state = initial_state(participants, torch.rand(n, generator=g))
+    state = replace(state, colours=state.colours[:, -axes:].contiguous())
     near = torch.randint(0, n, (n, k), generator=g, dtype=torch.int32)
     exact = pair_costs(state, near, dtype=torch.float64)
     scale = exact.amax(1, keepdim=True)
@@ -192,11 +174,9 @@ def test_float32_costs_rank_pairs_as_float64_does():
         features_dc=torch.randn(n, 3, generator=g),
         features_rest=torch.zeros(n, 0, 3),
     )
-    state = state_of(scene)
-    i, j = torch.arange(n), torch.randint(0, n, (n, 8), generator=g)
-    for direction in range(len(DIRECTIONS)):
-        a, b = (costs_along(state, direction, i, j, dtype) for dtype in (torch.float64, torch.float32))
-        assert float((a - b).abs().max()) < 2e-3 * float(a.max())  # 1e-3 of an area, squared
+    state, near = state_of(scene), torch.randint(0, n, (n, 8), generator=g)
+    a, b = (pair_costs(state, near, dtype=dtype, compiled=False) for dtype in (torch.float64, torch.float32))
+    assert float((a - b).abs().max()) < 2e-3 * float(a.max())  # 1e-3 of an area, squared
 
 
 def test_the_area_is_the_root_mean_square_over_directions():
@@ -207,8 +187,8 @@ def test_the_area_is_the_root_mean_square_over_directions():
     assert float(rms_area(six)) == pytest.approx(float(areas.square().mean().sqrt()), rel=0.01)  # 200,000 samples
 
 
-@pytest.mark.parametrize("length", [1.0, 1e6, 1e12, 1e30])
-@pytest.mark.parametrize("width", [1.0, 1e-3, 1e-9, 0.0])
+@pytest.mark.parametrize("length", [1.0, 1e6, 1e30])
+@pytest.mark.parametrize("width", [1.0, 1e-9, 0.0])
 def test_no_overlap_exceeds_the_smaller_area(length, width):
     """Of needles along one direction, whose areas are lost to rounding as soon as they are long enough."""
     generator = torch.Generator().manual_seed(0)

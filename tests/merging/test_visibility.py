@@ -14,7 +14,7 @@ from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
-from pointsplat_ns.merging.participants import Participants
+from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.merging.visibility import (
     Viewpoints,
     covered_per_area,

@@ -5,7 +5,7 @@ import torch
 
 from making import same, scene_to_refine, small_refiner
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.refiner import Refiner
 
 
@@ -76,7 +76,7 @@ def test_means_stay_within_reach_and_follow_the_extent():
     assert torch.allclose(moved, (0.02 * extent).expand_as(moved), rtol=1e-4)
 
 
-@pytest.mark.parametrize("sh_degree", [0, 1, 2])
+@pytest.mark.parametrize("sh_degree", [0, 2])
 def test_a_scene_of_lower_degree_is_refined_as_if_padded_with_zeros(sh_degree):
     scene = scene_to_refine(sh_degree=sh_degree)
     padding = torch.zeros(len(scene), 15 - scene.features_rest.shape[1], 3)
@@ -142,16 +142,7 @@ def test_a_float64_network_equals_the_float32_one_within_rounding():
 def test_parameter_groups_hold_every_parameter_once():
     refiner = small_refiner()
     groups = refiner.parameter_groups()
-    assert set(groups) == {
-        "encoder",
-        "backbone",
-        "means",
-        "scales",
-        "quats",
-        "opacities",
-        "features_dc",
-        "features_rest",
-    }
+    assert set(groups) == {"encoder", "backbone", *PARAMETERS}
     ids = [id(p) for group in groups.values() for p in group]
     assert sorted(ids) == sorted(id(p) for p in refiner.parameters())
     assert "encoder" not in small_refiner(encoder="concat").parameter_groups()
@@ -165,7 +156,6 @@ def test_a_scene_of_a_higher_degree_than_the_network_is_refused():
 def hard_scenes() -> dict[str, Gaussians]:
     base = scene_to_refine(60, sh_degree=1)
     line = torch.linspace(-3, 3, 60)[:, None] * torch.tensor([1.0, 2.0, 3.0])
-    plane = base.means * torch.tensor([1.0, 0.0, 1.0])
     outlier = base.means.clone()
     outlier[7] = 1e7
     values = torch.tensor([torch.inf, -torch.inf, 40.0, -40.0])
@@ -176,13 +166,11 @@ def hard_scenes() -> dict[str, Gaussians]:
     )
     return {
         "one": base[:1],
-        "two": base[:2],
         "coincident": base.replace(means=torch.full((60, 3), 1.5)),
         "within 1e-30": base.replace(means=base.means * 1e-30),
         # too few to tell an outlier from a scene: the others share a cell
         "one voxel and one far": base[:6].replace(means=torch.cat([base.means[:5] * 1e-6, torch.ones(1, 3)])),
         "line": base.replace(means=line),
-        "plane": base.replace(means=plane),
         "duplicates": Gaussians.cat([base[:20]] * 3),
         "outlier": base.replace(means=outlier),
         "far from the origin": base.replace(means=base.means + 1e6),

@@ -1,6 +1,5 @@
-"""Weights, their config, and orders of voxels."""
+"""Files of weights, also hostile ones, and configurations."""
 
-import itertools
 import json
 import math
 import re
@@ -24,7 +23,6 @@ from pointsplat_ns.refiner import (
     save_refiner,
 )
 from pointsplat_ns.refiner.config import RefinerConfig
-from pointsplat_ns.refiner.serialization import curve_codes
 from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
@@ -114,12 +112,9 @@ def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
 HUGE = [
     {"enc_channels": [1 << 40, 48, 64]},
     {"enc_channels": [1 << 16, 1 << 16, 1 << 16]},
-    {"enc_channels": [10**400, 48, 64]},
     {"feature_dim": 1 << 16, "color_hidden": 1 << 16, "color_dim": 1 << 16},
     {"head_width": 1 << 40},
     {"head_depth": 1 << 40},
-    {"head_depth": 1 << 16},
-    {"enc_depths": [1 << 30, 1, 1]},
     {"enc_depths": [1 << 16, 1, 1]},
     {"mlp_ratio": 1 << 16},
     {"patch": 1 << 40},
@@ -144,16 +139,16 @@ def little_memory():
 def test_a_configuration_too_large_for_its_file_takes_no_memory(changes, tmp_path, little_memory):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    rewrite(path, config={**trained().config.to_dict(), **changes})
+    rewrite(path, config={**vars(trained().config), **changes})
     with pytest.raises(WeightsError, match="refiner.safetensors: "):
         read_refiner(path)
 
 
-@pytest.mark.parametrize("name", sorted(trained().config.to_dict()))
+@pytest.mark.parametrize("name", sorted(vars(trained().config)))
 def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    right = trained().config.to_dict()
+    right = vars(trained().config)
     refused = 0
     for value in WRONG:
         rewrite(path, config={**right, name: value})
@@ -175,7 +170,7 @@ def test_settings_of_a_wrong_type_are_one_error(name, tmp_path):
 def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
     path = tmp_path / "refiner.safetensors"
     save_refiner(trained(), path)
-    header = {"format": REFINER_FORMAT, "config": json.dumps(trained().config.to_dict()), "metadata": "{}"}
+    header = {"format": REFINER_FORMAT, "config": json.dumps(vars(trained().config)), "metadata": "{}"}
     save_file(load_file(path), path, metadata={**header, key: text.encode("utf-8", "replace").decode()})
     with pytest.raises(WeightsError, match=f"refiner.safetensors: {key} is "):
         (read_refiner if key == "config" else read_metadata)(path)
@@ -193,8 +188,8 @@ def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
         ({"enc_depths": (1, 1)}, "enc_depths has 2 entries; expected 3"),
         ({"dec_heads": (5, 3)}, "dec: 32 channels do not divide into 5 heads"),
         ({"strides": (2, 3)}, "strides holds 3; expected powers of two"),
-        ({"curves": ("z", "peano")}, "expected names out of z, z-trans"),
-        ({"curves": ()}, "expected names out of"),
+        ({"curves": ("z", "peano")}, "expected z, z-trans"),
+        ({"curves": ()}, "curves is (); expected z"),
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"grid": 1000}, "grid is 1000"),
         ({"encoder": "single"}, "encoder is 'single'"),
@@ -209,54 +204,6 @@ def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
 def test_contradictory_settings_are_refused_by_name(changes, message):
     with pytest.raises(RefinerConfigError, match=re.escape(message)):
         preset("tiny", **changes)
-
-
-def full_grid(side: int) -> torch.Tensor:
-    return torch.tensor(list(itertools.product(range(side), repeat=3)))
-
-
-@pytest.mark.parametrize("bits", [16, 20])
-def test_z_order_equals_python_interleaving_at_full_width(bits):
-    generator = torch.Generator().manual_seed(0)
-    coords = torch.randint(0, 2**bits, (50, 3), generator=generator)
-    expected = [
-        sum(((int(c) >> b) & 1) << (3 * b + 2 - a) for b in range(bits) for a, c in enumerate(row)) for row in coords
-    ]
-    assert curve_codes(coords, bits, ["z"])[0].tolist() == expected
-
-
-def test_unknown_curves_and_widths_are_refused():
-    with pytest.raises(ValueError, match="no curve 'peano'"):
-        curve_codes(full_grid(2), 1, ["peano"])
-    with pytest.raises(ValueError, match="21 bits"):
-        curve_codes(full_grid(2), 21, ["z"])
-
-
-def skilling(point: list[int], bits: int) -> int:
-    """Hilbert code of one point, bit by bit, as published."""
-    axes = list(point)
-    for bit in range(bits - 1, 0, -1):
-        low = (1 << bit) - 1
-        for i in range(3):
-            if axes[i] >> bit & 1:
-                axes[0] ^= low
-            else:
-                swapped = (axes[0] ^ axes[i]) & low
-                axes[0] ^= swapped
-                axes[i] ^= swapped
-    axes[1] ^= axes[0]
-    axes[2] ^= axes[1]
-    parity = 0
-    for bit in range(bits - 1, 0, -1):
-        if axes[2] >> bit & 1:
-            parity ^= (1 << bit) - 1
-    return sum(((axis ^ parity) >> b & 1) << (3 * b + 2 - i) for i, axis in enumerate(axes) for b in range(bits))
-
-
-@pytest.mark.parametrize("bits", [1, 2, 5, 16, 19, 20])
-def test_hilbert_tables_give_the_codes_of_the_published_algorithm(bits):
-    coords = torch.randint(0, 2**bits, (200, 3), generator=torch.Generator().manual_seed(2))
-    assert curve_codes(coords, bits, ["hilbert"])[0].tolist() == [skilling(point, bits) for point in coords.tolist()]
 
 
 def test_unknown_names_are_refused():

@@ -1,0 +1,217 @@
+"""A scene that is larger than memory, in cells: parts of a space-filling curve with equally many Gaussians.
+
+Each cell has a file of its own, in a folder of finished steps.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_cells
+from pointsplat_ns.io.files import (
+    logger,
+    one_line,
+    read_text,
+    replacing,
+    require_space,
+    write_json,
+    write_tensors,
+)
+from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.usable import usable_part
+from pointsplat_ns.system.tensors import INDICES
+
+ROWS_AT_ONCE = 1 << 17
+"""Number of rows that are read at once."""
+
+OVERVIEW = 1 << 18
+"""Number of Gaussians of the thinned scene, about as many as are drawn to count covered pixels."""
+
+
+class Scratch:
+    """A folder whose files are complete, or not there.
+
+    Args:
+        folder: it is created. If it holds steps of other work, these are removed.
+        work: description of the work, as JSON has it: all that its steps depend on.
+        size: bytes of all steps together; they must be free for new work.
+
+    Raises:
+        SceneError: if the folder cannot be used, or the disk has no room for it.
+    """
+
+    def __init__(self, folder: Path, work: Mapping[str, object], size: int = 0):
+        self.folder = folder
+        known = folder / "work.json"
+        try:
+            same = known.is_file() and json.loads(read_text(known)) == work
+        except ValueError:
+            same = False
+        try:
+            if not same and folder.exists():
+                shutil.rmtree(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SceneError(f"{folder}: cannot be used ({error.strerror or one_line(error)})") from error
+        if not same:
+            require_space(folder, folder, size)
+            write_json(work, known)
+
+    def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
+        """The tensors of a step, which is taken if it was not before."""
+        self.make(name, make)
+        return self.known(name)
+
+    def make(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> None:
+        """Take a step that gives tensors, unless it was taken before."""
+        if not self.has(name):
+            write_tensors(self._path(name), make(), {})
+
+    def has(self, name: str) -> bool:
+        """Whether a step was taken that gave tensors."""
+        return self._path(name).is_file()
+
+    def known(self, name: str) -> dict[str, Tensor]:
+        """The tensors of a step that was taken. Raises SceneError if its file is gone or damaged."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            return load_file(self._path(name))
+        except (OSError, SafetensorError) as error:
+            raise SceneError(f"{self.folder}: damaged ({one_line(error)}); remove it and start again") from error
+
+    def drop(self, name: str) -> None:
+        """Remove the tensors of a step, if they are there."""
+        self._path(name).unlink(missing_ok=True)
+
+    def file(self, name: str, make: Callable[[Path], None]) -> Path:
+        """The file of a step, which is taken if it was not before: ``make`` writes to a path that is renamed then."""
+        path = self.folder / name
+        if not path.is_file():
+            with replacing(path) as part:
+                make(part)
+        return path
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A scene in cells."""
+
+    scratch: Scratch
+    sample: Gaussians  # [m] every so many-th Gaussian of the file, along the curve
+    keys: Tensor  # [m] int64, of the sample on the curve, ascending
+    cube: Cube
+    """What the curve fills."""
+    counts: tuple[int, ...]
+    """Number of Gaussians in each cell."""
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in all cells."""
+        return sum(self.counts)
+
+    def read(self, cell: int) -> Gaussians:
+        """The Gaussians of a cell, in the order of the file."""
+        path = self.scratch.folder / _name(cell)
+        widths = [values[:0].flatten(1).shape[1] for values in self.sample.tensors()]
+        scene = self.sample.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
+        with path.open("rb") as stream:
+            for start in range(0, len(scene), ROWS_AT_ONCE):
+                count = min(ROWS_AT_ONCE, len(scene) - start)
+                table = np.fromfile(stream, "<f4", count * sum(widths))
+                if len(table) < count * sum(widths):
+                    raise SceneError(f"{path}: truncated; remove the folder and start again")
+                columns = torch.from_numpy(table.reshape(count, -1).astype(np.float32, copy=False))
+                for (_, into), values in zip(scene.items(), columns.split(widths, dim=1), strict=True):
+                    into[start : start + count] = values.reshape(count, *into.shape[1:])
+        return scene
+
+    def keys_of(self, scene: Gaussians) -> Tensor:
+        """Places (n,) int64 of Gaussians on the curve."""
+        return torch.cat([curve_keys(unit_cells(means, self.cube)) for means in scene.means.split(ROWS_AT_ONCE)])
+
+
+def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float], None]) -> Cells:
+    """Write a file of each cell.
+
+    Args:
+        rows: the scene. Gaussians that cannot be drawn are dropped, and counted in a warning.
+        most: largest number of Gaussians in a cell, about.
+        scratch: where files are.
+        report: called with the share done.
+
+    Raises:
+        SceneError: if the file cannot be read, or no Gaussian of the sample can be drawn.
+    """
+    picked = range(0, rows.count, -(-rows.count // OVERVIEW))
+    some = rows.pick(picked)
+    usable = some.usable()
+    if not bool(usable.any()):
+        raise SceneError(
+            f"{rows.path}: none of {len(some)} Gaussians in it can be drawn: all have NaN or infinite values"
+        )
+    numbers = torch.tensor(picked, **INDICES)[usable]
+    some = usable_part(some)
+    cube = bulk_cube(some.means)
+    keys = curve_keys(unit_cells(some.means, cube))
+    places = _places(keys, numbers, rows.count).sort().values
+    cells = -(-rows.count // most)
+    borders = places[torch.arange(1, cells, **INDICES) * len(places) // cells]
+
+    def write() -> dict[str, Tensor]:
+        counts = torch.zeros(cells, **INDICES)
+        with ExitStack() as stack:
+            files = [stack.enter_context((scratch.folder / _name(cell)).open("wb")) for cell in range(cells)]
+            for start in range(0, rows.count, ROWS_AT_ONCE):
+                piece = rows.read(start, min(start + ROWS_AT_ONCE, rows.count))
+                numbers = torch.arange(start, start + len(piece), **INDICES)[piece.usable()]
+                piece = usable_part(piece)
+                own = curve_keys(unit_cells(piece.means, cube))
+                cell = torch.searchsorted(borders, _places(own, numbers, rows.count), right=True)
+                table = torch.cat([values.flatten(1) for values in piece.tensors()], dim=1)
+                sizes = torch.bincount(cell, minlength=cells)
+                counts += sizes
+                parts = table[cell.argsort(stable=True)].split(sizes.tolist())
+                for file, part in zip(files, parts, strict=True):
+                    part.numpy().astype("<f4", copy=False).tofile(file)
+                report(min(1.0, (start + ROWS_AT_ONCE) / rows.count))
+        dropped = rows.count - int(counts.sum())
+        if dropped:
+            logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", rows.path, dropped, rows.count)
+        return {"counts": counts}
+
+    counts = scratch.tensors("counts", write)["counts"]
+    order = keys.argsort(stable=True)
+    return Cells(scratch, some[order], keys[order], cube, tuple(counts.tolist()))
+
+
+def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:
+    """Places (n,) int64 on the curve, from keys on the curve and the numbers of ``count`` rows. The last 21 bits hold
+    the order in the file, so that Gaussians at one position can be parted too."""
+    return ((keys >> 18) << 21) | (numbers * (1 << 21) // count)
+
+
+def _name(cell: int) -> str:
+    return f"cell_{cell:04d}.rows"
