@@ -297,7 +297,7 @@ def lod(
             if stream is None:
                 check_level_folder(Path(folder), len(budgets), force)
             else:
-                check_stream_folder(Path(folder), force, viewer.files if viewer else ())
+                check_stream_folder(Path(folder), force, viewer or ())
             stack.enter_context(claimed_folder(Path(folder)))
         dense, view_source = read_source(scene, views, resolution, up, data)
         source = None if isinstance(scene, Gaussians) else source_file(scene)

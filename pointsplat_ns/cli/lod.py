@@ -61,8 +61,8 @@ def lod(
             --stream, the folder for lod-meta.json and its SOG files, by default room_stream.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
         html: write PlayCanvas' SuperSplat viewer beside the stream, which is turned until -y is up, as viewers show
-            it. `pointsplat view` serves the folder. The viewer (npm, MIT, 3 MB) is downloaded once, or comes from the
-            tarball or folder that the environment variable POINTSPLAT_WEB_VIEWER names.
+            it. Any web server can serve the folder. The viewer (npm, MIT, 3 MB) is downloaded, or comes from the
+            tarball that the environment variable POINTSPLAT_WEB_VIEWER names.
         chunk_count: Gaussians in a chunk of a stream, thousands of 1024, about.
         chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
@@ -100,7 +100,7 @@ def lod(
     else:
         _print_table(made, folder)
         if html:
-            print(f"{shlex.join(['pointsplat', 'view', str(folder)])} shows it in the browser")
+            print(f"{shlex.join(['python', '-m', 'http.server', '-d', str(folder)])} serves it at http://localhost:8000")
 
 
 def _print_table(made: Levels, folder: Path) -> None:

@@ -22,7 +22,7 @@ from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pages.stream_page import StreamPage, page_files
+from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 
@@ -72,7 +72,7 @@ def write_stream(
         chunks: sizes of the pieces.
         force: whether an existing stream may be overwritten.
         progress: called while encoding.
-        page: written beside it; the levels are turned as it says. By default the page of an older stream is removed.
+        page: written beside it; the levels are turned as it says.
 
     Returns:
         The number of Gaussians written of each level.
@@ -94,8 +94,6 @@ def write_stream(
         for name, data in files.items():
             stack.enter_context(replacing(folder / name, len(data))).write_bytes(data)
         counts = write_sog_stream(scenes, tree, folder / STREAM_META, sizes.count, progress)["counts"]
-        for file in page_files(folder):
-            file.unlink()
     return counts
 
 
