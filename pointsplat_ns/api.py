@@ -29,7 +29,7 @@ from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.levels.folder import check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
-from pointsplat_ns.levels.stream import Chunks, check_stream_folder
+from pointsplat_ns.levels.stream import check_stream_folder
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page
@@ -247,7 +247,7 @@ def lod(
     up: str | None = None,
     data: str | Path | None = None,
     folder: str | Path | None = None,
-    stream: Chunks | None = None,
+    stream: bool = False,
     html: bool = False,
     force: bool = False,
     progress: bool | Progress = False,
@@ -266,7 +266,7 @@ def lod(
         up: as for :func:`prune`.
         data: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
-        stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
+        stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         force: overwrite existing files in ``folder``.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
@@ -289,15 +289,15 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    if html and (stream is None or folder is None):
+    if html and (not stream or folder is None):
         raise PointSplatError("a page is written beside a stream; expected --stream with --html")
     viewer = web_viewer() if html else None
     with ExitStack() as stack:
         if folder is not None:
-            if stream is None:
-                check_level_folder(Path(folder), len(budgets), force)
-            else:
+            if stream:
                 check_stream_folder(Path(folder), force, viewer or ())
+            else:
+                check_level_folder(Path(folder), len(budgets), force)
             stack.enter_context(claimed_folder(Path(folder)))
         dense, view_source = read_source(scene, views, resolution, up, data)
         source = None if isinstance(scene, Gaussians) else source_file(scene)
@@ -307,8 +307,8 @@ def lod(
             page = stream_page(viewer, dense, known, up_named(up), Path(folder).resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
-        if folder is not None and stream is not None:
-            made.save_stream(folder, force, stream, report, page)
+        if folder is not None and stream:
+            made.save_stream(folder, force, report, page)
         elif folder is not None:
             made.save(folder, force)
     log((*made.notes, *([page.note] if page else [])))

@@ -6,7 +6,6 @@ level.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Sequence
@@ -18,22 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.pictures import size_quantiles
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.files import keep_usable
 from pointsplat_ns.io.source import SourceFile
-from pointsplat_ns.levels.errors import (
-    Displacement,
-    RenderErrors,
-    displacement,
-    far_references,
-    median_depth,
-)
+from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth
 from pointsplat_ns.levels.folder import write_levels
-from pointsplat_ns.levels.stream import Chunks, write_stream
+from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
@@ -55,10 +47,6 @@ class Level:
     parents: Tensor  # [M] int32, index in ``scene`` of the parent of each Gaussian of the level before; -1 if dropped
     dropped: int
     """Number of Gaussians of the dense scene without a place in this level, because they are too faint to be drawn."""
-    displacement: Displacement
-    """Distances by which merging moved the centres of the dense scene's Gaussians, scene units."""
-    median_size: float
-    """Median of the Gaussians' largest standard deviations, scene units."""
     errors: RenderErrors | None
     """Errors of its renders against the dense scene's; None if there is no view."""
     seconds: float
@@ -72,9 +60,6 @@ class Level:
             "share": len(self.scene) / whole,
             "sh_degree": self.scene.sh_degree,
             "dropped": self.dropped,
-            "median_size": self.median_size,
-            "displacement": dataclasses.asdict(self.displacement),
-            "mse": near and near.error,
             "psnr": near and near.psnr,
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
@@ -156,14 +141,13 @@ class Levels:
         self,
         folder: str | Path,
         force: bool = False,
-        chunks: Chunks | None = None,
         progress: Progress = silent,
         page: StreamPage | None = None,
     ) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
         parents = [level.parents for level in self.levels[1:]]
-        return write_stream(folder, self.scenes, parents, chunks, force, progress, page)
+        return write_stream(folder, self.scenes, parents, force, progress, page)
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
@@ -317,8 +301,6 @@ def make_levels(
                 scene=merged.scene,
                 parents=parents,
                 dropped=int((merged.assignment < 0).sum()),
-                displacement=displacement(dense, merged.scene, merged.assignment),
-                median_size=size_quantiles(merged.scene)[1],
                 errors=errors,
                 seconds=seconds,
             )

@@ -153,8 +153,9 @@ def _shape(settings: FilmSettings, usual: tuple[int, int]) -> tuple[int, int]:
 
 def read_path(path: Path | str) -> CameraPath:
     """Read a camera path: JSON with ``camera_path``, ``render_width`` and ``render_height``, as nerfstudio's viewer
-    saves it. Cameras are float64, over black; without a speed there are 24 frames a second. Raises SceneError if there is no such file, and DataError if it is too large, is not such JSON, has
-    another camera model, or has an invalid camera."""
+    saves it. Cameras are float64, over black; without a speed there are 24 frames a second. Raises SceneError if there
+    is no such file, and DataError if it is too large, is not such JSON, has another camera model, or has an invalid
+    camera."""
     path = require_file(path, "a camera path saved by nerfstudio's viewer (JSON)")
     if path.stat().st_size > 64_000_000:  # nerfstudio writes about 500 bytes a frame
         raise DataError(f"{path}: {path.stat().st_size / 1e6:.0f} MB; expected a camera path of at most 64 MB")

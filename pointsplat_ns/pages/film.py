@@ -24,7 +24,11 @@ SplitScreen = Literal["side-by-side", "wipe"]
 
 
 def render_frames(
-    scenes: Sequence[Gaussians], views: Views, fps: float, split: SplitScreen = "side-by-side", labels: Sequence[str] = ()
+    scenes: Sequence[Gaussians],
+    views: Views,
+    fps: float,
+    split: SplitScreen = "side-by-side",
+    labels: Sequence[str] = (),
 ) -> Iterator[np.ndarray]:
     """Draw the frames (H, W, 3) uint8 of a film of one scene or two. Two have ``labels``, unless these are empty."""
     for index, view in enumerate(views):

@@ -34,7 +34,6 @@ from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import View
 
-
 READABLE_NAMES = (
     *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt", ".pth", ".zip",
 )  # fmt: skip
