@@ -10,9 +10,8 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, normal_scene, same
+from making import ball, same
 from pointsplat_ns.levels import folder as level_folder
-from pointsplat_ns.levels.errors import displacement
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.merging import merge_levels
 
@@ -97,7 +96,6 @@ def test_the_manifest_is_true_of_the_files(folder, scene):
         read = ps.load(folder / level["file"])
         assert (len(read), read.sh_degree) == (level["count"], level["sh_degree"]) == (count, 1)
         assert level["share"] == count / 400
-        assert level["median_size"] == pytest.approx(float(read.stds.amax(dim=1).quantile(0.5, interpolation="higher")))
         parents = np.load(folder / level["parents"]["file"])
         assert parents.shape == (finer,) and parents.dtype == np.int32 and parents.max() == count - 1
         finer = count
@@ -123,7 +121,6 @@ def test_the_errors_in_the_manifest_are_those_of_the_files(folder, scene, views)
         read = ps.load(folder / level["file"])
         images = [ps.render(read, view) for view in views]
         gaps = np.stack([(a.double() - b.double()).numpy() for a, b in zip(images, dense, strict=True)])  # [C, H, W, 3]
-        assert level["mse"] == pytest.approx((gaps**2).mean(), rel=1e-9)
         assert level["psnr"] == pytest.approx(psnr((gaps**2).mean() / covered.mean()), abs=1e-6)
         assert level["worst_psnr"] == pytest.approx(psnr(((gaps**2).mean(axis=(1, 2, 3)) / covered).max()), abs=1e-6)
         similar = [float(ps.ssim(a, b)) for a, b in zip(images, dense, strict=True)]
@@ -218,14 +215,3 @@ def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, 
     assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
     assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
-
-
-@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
-def test_displacements_neither_overflow_nor_vanish(size):
-    dense, level = normal_scene(4), normal_scene(2)
-    dense = dense.replace(means=torch.tensor([[0.0, 0, 0], [3, 4, 0], [0, 0, 0], [9, 9, 9]]) * size)
-    level = level.replace(means=torch.tensor([[0.0, 0, 0], [0, 0, 2]]) * size)
-    moved = displacement(dense, level, torch.tensor([0, 0, 1, -1]))
-    assert moved.rms == pytest.approx(math.sqrt(29 / 3) * size, rel=1e-6)
-    assert moved.median == pytest.approx(2 * size, rel=1e-6)
-    assert moved.p95 == pytest.approx((2 + 0.9 * 3) * size, rel=1e-6)

@@ -164,10 +164,9 @@ def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
     settle(opened)
 
 
-def test_a_browser_without_workers_or_floats_draws_the_same(browser, written, opened):
+def test_a_browser_without_floats_draws_the_same(browser, written, opened):
     expected = picture(opened)
     without = """
-      Worker = class { constructor() { throw new Error("no worker") } };
       const original = WebGL2RenderingContext.prototype.getExtension;
       WebGL2RenderingContext.prototype.getExtension = function (name) {
         return name.includes("float") ? null : original.call(this, name);
@@ -177,7 +176,6 @@ def test_a_browser_without_workers_or_floats_draws_the_same(browser, written, op
         shrink(browser)
         plain = picture(browser)
         assert browser.execute_script("return flight.drawer.format === flight.drawer.gl.RGBA8")
-        assert browser.execute_script("return flight.scenes.every(({ sorting }) => !sorting.worker)")
     # Sums of 8-bit numbers are rounded at each Gaussian.
     assert ps.psnr(plain, expected) > 35
 
