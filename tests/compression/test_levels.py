@@ -67,11 +67,13 @@ def test_a_level_alone_is_what_prune_gives(scene, views):
 
 
 def test_composing_parents_gives_where_merging_put_each_gaussian(scene, levels, views):
-    for index, merged in enumerate(merge_levels(scene, [200, 100, 40, 12], views=views)):
-        assert torch.equal(levels.assignment(index), merged.assignment)
-        assert torch.equal(levels.assignment(index - len(levels)), merged.assignment)
-    with pytest.raises(IndexError):
-        levels.assignment(4)
+    found = levels[0].assignment
+    for merged, parents in zip(
+        merge_levels(scene, [200, 100, 40, 12], views=views), [*levels.parents, None], strict=True
+    ):
+        assert torch.equal(found, merged.assignment)
+        if parents is not None:
+            found = torch.where(found >= 0, parents[found.clamp_min(0)], -1)
 
 
 def test_the_manifest_is_true_of_the_files(folder, scene):
@@ -87,18 +89,13 @@ def test_the_manifest_is_true_of_the_files(folder, scene):
         "psnr_farther": manifest["source"]["psnr_farther"],  # recomputed below
     }
     named = {"lod.json", "lod.png"}
-    finer = 400
     for level, count in zip(manifest["levels"], (200, 100, 40, 12), strict=True):
-        for facts in (level, level["parents"]):
-            content = (folder / facts["file"]).read_bytes()
-            assert (facts["bytes"], facts["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
-            named.add(facts["file"])
+        content = (folder / level["file"]).read_bytes()
+        assert (level["bytes"], level["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
+        named.add(level["file"])
         read = ps.load(folder / level["file"])
         assert (len(read), read.sh_degree) == (level["count"], level["sh_degree"]) == (count, 1)
         assert level["share"] == count / 400
-        parents = np.load(folder / level["parents"]["file"])
-        assert parents.shape == (finer,) and parents.dtype == np.int32 and parents.max() == count - 1
-        finer = count
     assert {path.name for path in folder.iterdir()} == named
     corners = {"min": scene.means.amin(dim=0).tolist(), "max": scene.means.amax(dim=0).tolist()}
     assert manifest["bounds"]["all"] == corners
@@ -147,7 +144,7 @@ def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scen
     assert contents(tmp_path / "old") == before and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("taken", ["lod.json", "lod.png", "level_0.ply", "level_3_parents.npy"])
+@pytest.mark.parametrize("taken", ["lod.json", "lod.png", "level_0.ply", "level_3.ply"])
 def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_path):
     (tmp_path / "other.txt").write_text("mine")
     (tmp_path / taken).write_text("precious")

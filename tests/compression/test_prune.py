@@ -133,7 +133,7 @@ def leaves_of(node: Node) -> list[Node]:
 
 
 def parents_of(levels: ps.Levels) -> list[torch.Tensor]:
-    return [level.parents.long() for level in levels.levels[1:]]
+    return levels.parents
 
 
 def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(levels):
