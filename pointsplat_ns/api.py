@@ -22,14 +22,13 @@ from pointsplat_ns.compression.trained_refiner import (
 )
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.io.source import source_file
-from pointsplat_ns.levels.folder import check_level_folder
+from pointsplat_ns.levels.folder import check_folder, check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
-from pointsplat_ns.levels.stream import check_stream_folder
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page
@@ -295,7 +294,7 @@ def lod(
     with ExitStack() as stack:
         if folder is not None:
             if stream:
-                check_stream_folder(Path(folder), force, viewer or ())
+                check_folder(Path(folder), (STREAM_META, *(viewer or ())), force)
             else:
                 check_level_folder(Path(folder), len(budgets), force)
             stack.enter_context(claimed_folder(Path(folder)))

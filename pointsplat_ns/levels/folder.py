@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,19 @@ from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
 
 
-def check_level_folder(folder: Path, count: int, force: bool) -> None:
-    """Raise a SceneError, before the long computations, if ``count`` levels may not be written to a folder: it is a
-    file or named like one, or holds a file that must not be overwritten."""
-    if folder.suffix.lower() in (".ply", ".json", ".png"):
+def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
+    """Raise a SceneError, before the long computations, if files may not be written to a folder: it is a file or named
+    like one, or holds one of these files, which must not be overwritten."""
+    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
-    if folder.exists() and not folder.is_dir():
-        raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    for name in (FOLDER_FILES.levels, FOLDER_FILES.levels_picture, *map(_file_name, range(count))):
+    for name in names:
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
+
+
+def check_level_folder(folder: Path, count: int, force: bool) -> None:
+    """:func:`check_folder` for ``count`` levels."""
+    check_folder(folder, (FOLDER_FILES.levels, FOLDER_FILES.levels_picture, *map(_file_name, range(count))), force)
 
 
 def write_levels(

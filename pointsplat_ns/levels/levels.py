@@ -104,11 +104,6 @@ class Levels:
         return [level.scene for level in self]
 
     @property
-    def errors(self) -> list[RenderErrors | None]:
-        """The errors of each level's renders."""
-        return [level.errors for level in self]
-
-    @property
     def parents(self) -> list[Tensor]:
         """For each level but the last, the index (M,) int64 in the next of the parent of each Gaussian; -1 if it is
         dropped."""

@@ -6,33 +6,24 @@ coarsest one. Where two leaves of different levels meet, nothing is drawn twice 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
+from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLOATS, INDICES
-
-
-def check_stream_folder(folder: Path, force: bool, page: Iterable[str] = ()) -> None:
-    """Raise SceneError if a stream, and the files of its page, may not be written to a folder, which need not exist."""
-    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
-        raise SceneError(f"{folder}: a stream is several files; expected the name of a folder")
-    for name in (STREAM_META, *page):
-        if (folder / name).exists() and not force:
-            raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
 
 def write_stream(
@@ -62,7 +53,7 @@ def write_stream(
     """
     folder = Path(folder)
     files = {} if page is None else page.files
-    check_stream_folder(folder, force, files)
+    check_folder(folder, (STREAM_META, *files), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
     if page is not None and page.turn is not None:
         scenes = [page.turn.apply(scene) for scene in scenes]

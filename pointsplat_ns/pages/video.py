@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import lack_of_room, one_line, replacing
+from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.outputs import LOCK_NAME
 
 Kind = Literal["video", "frames", "picture"]
@@ -81,12 +81,9 @@ def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
         beside.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=beside) as part:
             count = 0
-            try:
-                for pixels in frames:
-                    _write_png(pixels, Path(part) / f"frame_{count:05d}.png")
-                    count += 1
-            except OSError as error:
-                raise OSError(f"{error.strerror or one_line(error)}{lack_of_room(error, Path(part))}") from error
+            for pixels in frames:
+                _write_png(pixels, Path(part) / f"frame_{count:05d}.png")
+                count += 1
             folder.mkdir(exist_ok=True)
             for old in folder.iterdir():
                 if _FRAME.fullmatch(old.name) and not (Path(part) / old.name).exists():

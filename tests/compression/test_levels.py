@@ -161,7 +161,7 @@ def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("file", "is a file; expected the name of a folder"), ("small.ply", "levels are several files")],
+    [("file", "levels are several files"), ("small.ply", "levels are several files; expected the name of a folder")],
 )
 def test_a_folder_that_cannot_be_one_is_refused_before_a_scene_is_read(name, message, tmp_path):
     (tmp_path / "file").write_text("precious")

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import before_pages_load, chromium, complaints
+from browser import before_pages_load, chromium, complaints, phone_and_colours
 from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
@@ -131,6 +131,7 @@ def test_keys_go_turn_and_lead_back(opened):
     canvas.send_keys("[")
     assert opened.execute_script("return flight.wipe") == pytest.approx(0.45)
     settle(opened)
+    assert phone_and_colours(opened)[0] == 360, "pixels: nothing is wider than the phone"
 
 
 def hold(browser, key: str) -> None:
