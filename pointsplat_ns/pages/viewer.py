@@ -140,7 +140,7 @@ class Viewer:
     ):
         share_freed_memory()  # each request has a thread
         self._up, self._read = up, read
-        self._drawing, self._encoding, self._dropping = threading.Lock(), threading.Lock(), threading.Lock()
+        self._working, self._dropping = threading.Lock(), threading.Lock()
         self._stage: _Stage | None = None
         routes = {
             "/": Route(self._page),
@@ -176,7 +176,7 @@ class Viewer:
             return
         self._server.close()
         # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
-        for lock in (self._drawing, self._encoding, self._dropping):
+        for lock in (self._working, self._dropping):
             lock.acquire(timeout=5.0)  # s
         if self._stage is not None:
             self._stage.close(5.0)
@@ -213,14 +213,14 @@ class Viewer:
         headers = {"X-State": json.dumps(stage.state(index, percent, level, whole))}
         if level.how == have or not wanted["spz"]:
             return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
-        with self._encoding:
+        with self._working:
             # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
             level.spz = level.spz or stage.frame.encoded(level.scene, stage.scenes[index].name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
 
     def _picture(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
         """What a page's camera sees, for browsers that cannot draw."""
-        with self._drawing:
+        with self._working:
             try:
                 return Answer(stage.picture(wanted), "image/jpeg")
             except RuntimeError as error:  # too little memory
