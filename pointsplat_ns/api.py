@@ -22,13 +22,12 @@ from pointsplat_ns.compression.trained_refiner import (
 )
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.folder import check_level_folder
+from pointsplat_ns.levels.folder import check_folder, check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
-from pointsplat_ns.levels.stream import Chunks, check_stream_folder
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page
@@ -242,7 +241,7 @@ def lod(
     up: str | None = None,
     data: str | Path | None = None,
     folder: str | Path | None = None,
-    stream: Chunks | None = None,
+    stream: bool = False,
     html: bool = False,
     force: bool = False,
     progress: bool | Progress = False,
@@ -259,7 +258,7 @@ def lod(
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
-        stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
+        stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         force: overwrite existing files in ``folder``.
 
@@ -281,15 +280,15 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    if html and (stream is None or folder is None):
+    if html and (not stream or folder is None):
         raise PointSplatError("a page is written beside a stream; expected --stream with --html")
     viewer = web_viewer() if html else None
     with ExitStack() as stack:
         if folder is not None:
-            if stream is None:
-                check_level_folder(Path(folder), len(budgets), force)
+            if stream:
+                check_folder(Path(folder), (STREAM_META, *(viewer or ())), force)
             else:
-                check_stream_folder(Path(folder), force, viewer.files if viewer else ())
+                check_level_folder(Path(folder), len(budgets), force)
             stack.enter_context(claimed_folder(Path(folder)))
         dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
@@ -299,8 +298,8 @@ def lod(
             page = stream_page(viewer, dense, known, up_named(up), Path(folder).resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
-        if folder is not None and stream is not None:
-            made.save_stream(folder, force, stream, report, page)
+        if folder is not None and stream:
+            made.save_stream(folder, force, report, page)
         elif folder is not None:
             made.save(folder, force)
     log((*made.notes, *([page.note] if page else [])))

@@ -19,13 +19,13 @@ from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
 from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
-from pointsplat_ns.pages.film import FilmScenes, SplitScreen, render_frames
+from pointsplat_ns.pages.film import SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.pages.server import Served
+    from pointsplat_ns.pages.viewer import Viewer
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -106,10 +106,9 @@ def render_path(
     chosen = camera_path(loaded[0], view_source, path, settings, kind == "picture", upward)
     if labels is None:
         labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
-    film = FilmScenes(loaded[0], loaded[1] if other is not None else None, split, labels if other else ())
     logger.info("%d x %d pixels: %s", chosen.views.width, chosen.views.height, chosen.origin)
-    frames = tracked(render_frames(film, chosen.views, chosen.fps), "rendering", len(chosen.views), progress)
-    return write_frames(frames, output, chosen.fps, force)
+    frames = render_frames(loaded, chosen.views, chosen.fps, split, labels if len(loaded) > 1 else ())
+    return write_frames(tracked(frames, "rendering", len(chosen.views), progress), output, chosen.fps, force)
 
 
 def open_viewer(
@@ -121,15 +120,14 @@ def open_viewer(
     data: str | Path | None = None,
     host: str = "127.0.0.1",
     port: int = 7007,
-) -> Served:
+) -> Viewer:
     """Show a scene, or two scenes with the same camera, in the browser, which draws. Browsers without WebGL 2 show
     pictures that this machine's processor draws.
 
     It opens upright, at the known or sampled view that shows most of the scene, or at the whole of an object.
 
     Args:
-        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it. The folder
-            of a stream with a page (``lod(html=True)``) alone shows that page, which the browser draws.
+        scene: N Gaussians, or the path of a scene; by default the page takes a file that is dropped on it.
         other: a second scene in the same frame, to compare with; by default the first is compared with all of itself.
         views: known views of the first scene, as for :func:`render_path`.
         up: the axis that is up in the scene ("z", "-y"); by default the scene's own, or estimated.
@@ -152,13 +150,10 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    from pointsplat_ns.pages.stream_server import PageServer, is_stream_with_page
     from pointsplat_ns.pages.viewer import ViewedScene, Viewer
 
     upward = up_named(up)
     need_named_data(scene, data)
-    if isinstance(scene, (str, Path)) and other is None and up is None and is_stream_with_page(Path(scene)):
-        return PageServer(Path(scene), host, port)
 
     def read(path: Path, name: str) -> ViewedScene:
         loaded = load(path)

@@ -21,6 +21,7 @@ from pointsplat_ns.cli.printing import (
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
+    from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -133,9 +134,10 @@ def compact(
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
     with options.scene_written(written):
-        shown = None if picture is None else ps.plot_comparison(dense, result, picture)
+        files = [_file_text(scene), "not written" if written is None else _file_text(written)]
+        shown = None if picture is None else ps.plot_comparison(dense, result, picture, files)
         if html is not None:
-            _write_page(scene, dense, result, html, html_limit, up)
+            _write_page(scene, dense, result, files, html, html_limit, up, quality)
     if json_output:
         made = {
             "refined": result.accepted,
@@ -160,15 +162,33 @@ def compact(
     end_if_interrupted(result.interrupted)
 
 
-def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float, up: str | None) -> None:
+def _file_text(path: Path) -> str:
+    """Name and size of a scene's file or SOG folder; the name alone of a run."""
+    from pointsplat_ns.io.formats import SOG_META
+    from pointsplat_ns.io.runs import name_of
+
+    file = path / SOG_META if path.is_dir() else path
+    return f"{path.name}, {written_size(file)}" if file.is_file() and file.suffix != ".yml" else name_of(path)
+
+
+def _write_page(
+    scene: Path,
+    dense: Gaussians,
+    result: Compacted,
+    files: list[str],
+    html: Path,
+    limit_mb: float,
+    up: str | None,
+    quality: FullSizeQuality | None,
+) -> None:
     """The page to fly through the scene before and after."""
     import pointsplat_ns as ps
     from pointsplat_ns.io.runs import name_of
 
-    notes = []
-    if result.psnr is not None:
-        notes.append(f"The compact scene has {result.psnr:.1f} dB PSNR against the dense scene.")
+    names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)]
+    notes = [] if quality is None else [f"{quality}".splitlines()[0]]
+    sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
     ps.write_page(
-        [dense, result.scene], html, ["dense", "compact"], title=name_of(path), notes=notes, views=result.views,
-        up=up, limit_mb=limit_mb, progress=True,
+        [dense, result.scene], html, names, title=name_of(scene), notes=notes,
+        views=None if sampled else result.views, up=up, limit_mb=limit_mb, progress=True,
     )  # fmt: skip

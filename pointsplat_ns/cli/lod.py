@@ -21,8 +21,6 @@ def lod(
     output: options.Output = None,
     stream: bool = False,
     html: bool = False,
-    chunk_count: int = 512,
-    chunk_extent: float | None = None,
     sh: options.Bands = "all",
     poses: options.Poses = None,
     resolution: options.Resolution = None,
@@ -49,27 +47,23 @@ def lod(
             --stream, the folder for lod-meta.json and its SOG files, by default room_stream.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
         html: write PlayCanvas' SuperSplat viewer beside the stream, which is turned until -y is up, as viewers show
-            it. `pointsplat view` serves the folder. The viewer (npm, MIT, 3 MB) is downloaded once, or comes from the
-            tarball or folder that the environment variable POINTSPLAT_WEB_VIEWER names.
-        chunk_count: Gaussians in a chunk of a stream, thousands of 1024, about.
-        chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
+            it. Any web server can serve the folder. The viewer (npm, MIT, 3 MB) is downloaded, or comes from the
+            tarball that the environment variable POINTSPLAT_WEB_VIEWER names.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         json_output: print the manifest, and nothing else on standard output.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.discovery import FOLDER_FILES
-    from pointsplat_ns.levels.stream import Chunks
     from pointsplat_ns.system.threads import fixed_threads
 
     options.need_one_scene(scene)
     options.check_poses(poses)
     folder = output or options.output_beside(scene, "stream" if stream else "lod").with_suffix("")
-    chunks = Chunks(chunk_count << 10, chunk_extent) if stream else None
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            data=data, folder=folder, stream=chunks, html=html, force=force, progress=True,
+            data=data, folder=folder, stream=stream, html=html, force=force, progress=True,
         )  # fmt: skip
     if json_output and stream:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
@@ -78,7 +72,9 @@ def lod(
     else:
         _print_table(made, folder)
         if html:
-            print(f"{shlex.join(['pointsplat', 'view', str(folder)])} shows it in the browser")
+            print(
+                f"{shlex.join(['python', '-m', 'http.server', '-d', str(folder)])} serves it at http://localhost:8000"
+            )
 
 
 def _print_table(made: Levels, folder: Path) -> None:

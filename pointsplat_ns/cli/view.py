@@ -22,9 +22,6 @@ def view(
     `prune` does. The browser draws; one without WebGL 2 shows pictures that this machine's processor draws. Ctrl-C ends
     it.
 
-    The folder of a stream with a page (`pointsplat lod --stream --html`) alone is shown by that page, which the browser
-    draws; its lod-meta.json as other scenes are.
-
     Args:
         scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default the page
             takes a file that is dropped on it.

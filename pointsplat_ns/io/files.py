@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from torch import Tensor
 
@@ -53,34 +53,6 @@ def read_text(path: Path, most: int = 1 << 26) -> str:
     if found.st_size > most:
         raise ValueError(f"larger than {most:,} bytes")
     return path.read_text("utf-8")
-
-
-def open_inside(folder: Path, path: Path) -> BinaryIO:
-    """Open a regular file whose real path lies inside a folder, which may be a stranger's. A link that is put there
-    meanwhile is not followed.
-
-    Raises:
-        OSError: if there is no such file, or it cannot be read.
-    """
-    root = Path(os.path.realpath(folder))
-    real = Path(os.path.realpath(path))
-    if root not in real.parents:
-        raise OSError(errno.EPERM, f"leads out of {folder}", str(path))
-    if os.open not in os.supports_dir_fd:  # Windows
-        return open(real, "rb")
-    nothing_else = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
-    at = os.open(root, os.O_RDONLY)
-    try:
-        for part in real.relative_to(root).parts:
-            below = os.open(part, nothing_else, dir_fd=at)
-            os.close(at)
-            at = below
-        if not stat.S_ISREG(os.fstat(at).st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-    except BaseException:
-        os.close(at)
-        raise
-    return open(at, "rb")
 
 
 def require_memory(path: Path | str, size: int) -> None:

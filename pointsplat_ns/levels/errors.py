@@ -1,11 +1,9 @@
-"""Errors of a level of detail: of its renders in near and farther views, and of the positions of its Gaussians."""
+"""Errors of a level of detail: of its renders in near and farther views."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,17 +20,6 @@ class RenderErrors:
     """In the compared views."""
     farther: dict[int, float]
     """PSNR in dB by multiple of the distance, see :func:`far_references`."""
-
-
-@dataclass(frozen=True)
-class Displacement:
-    """Distances from the centres of the dense scene's Gaussians to the centres of the Gaussians that contain them in
-    the level, scene units. Dropped Gaussians do not count."""
-
-    rms: float
-    median: float
-    p95: float
-    """The 95th percentile."""
 
 
 def far_references(reference: Reference) -> dict[int, Reference]:
@@ -58,17 +45,6 @@ def far_references(reference: Reference) -> dict[int, Reference]:
 def _averaged(image: Tensor, side: int) -> Tensor:
     """Means (H // side, W // side, 3), float64, of squares of ``side`` pixels of an image (H, W, 3)."""
     return torch.nn.functional.avg_pool2d(image.double().permute(2, 0, 1), side).permute(1, 2, 0)
-
-
-@torch.no_grad()
-def displacement(dense: Gaussians, level: Gaussians, assignment: Tensor) -> Displacement:
-    """Measure how far merging moved the centres of Gaussians, by the index (N,) in ``level`` of each Gaussian of
-    ``dense``; -1 if dropped. At least one is not dropped."""
-    own = (assignment >= 0).nonzero()[:, 0]
-    pieces = own.split(1 << 20)  # because float64 takes memory
-    distances = torch.cat([(dense.means[i].double() - level.means[assignment[i]].double()).norm(dim=1) for i in pieces])
-    median, p95 = np.quantile(distances.cpu().numpy(), (0.5, 0.95))
-    return Displacement(math.sqrt(float(distances.square().mean())), float(median), float(p95))
 
 
 @torch.no_grad()

@@ -1,14 +1,13 @@
-"""The folder of written levels of detail: a PLY and the parents of each level, a manifest, and a picture."""
+"""The folder of written levels of detail: a PLY of each level, a manifest, and a picture."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
@@ -18,30 +17,24 @@ from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.files import replacing, write_json
 
 
-def file_names(index: int) -> tuple[str, str]:
-    """Names of the files of the level at ``index``: its scene, and the parents of the next finer level."""
-    return f"level_{index}.ply", f"level_{index}_parents.npy"
-
-
-def check_level_folder(folder: Path, count: int, force: bool) -> None:
-    """Raise a SceneError, before the long computations, if ``count`` levels may not be written to a folder: it is a
-    file or named like one, or holds a file that must not be overwritten."""
-    if folder.suffix.lower() in (".ply", ".json", ".png"):
+def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
+    """Raise a SceneError, before the long computations, if files may not be written to a folder: it is a file or named
+    like one, or holds one of these files, which must not be overwritten."""
+    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
-    if folder.exists() and not folder.is_dir():
-        raise SceneError(f"{folder}: is a file; expected the name of a folder")
-    for name in (
-        FOLDER_FILES.levels,
-        FOLDER_FILES.levels_picture,
-        *(name for index in range(count) for name in file_names(index)),
-    ):
+    for name in names:
         if (folder / name).exists() and not force:
             raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
 
+def check_level_folder(folder: Path, count: int, force: bool) -> None:
+    """:func:`check_folder` for ``count`` levels."""
+    check_folder(folder, (FOLDER_FILES.levels, FOLDER_FILES.levels_picture, *map(_file_name, range(count))), force)
+
+
 def write_levels(
     folder: Path | str,
-    levels: Sequence[tuple[Gaussians, Tensor]],
+    levels: Sequence[Gaussians],
     about: dict[str, Any],
     facts: Sequence[dict[str, Any]],
     images: Sequence[Tensor] = (),
@@ -55,7 +48,7 @@ def write_levels(
 
     Args:
         folder: created if it is missing.
-        levels: the scene of each, and the parents (M,) int32 of the level before it.
+        levels: their scenes.
         about, facts: the manifest's facts on all levels together, and on each.
         images, captions: (H, W, 3) each, of one size, with text below; none for no picture.
         force: whether existing files may be overwritten.
@@ -72,19 +65,20 @@ def write_levels(
             return stack.enter_context(replacing(folder / name))
 
         manifest = part_of(FOLDER_FILES.levels)  # entered first, left last
-        for index, (scene, parents) in enumerate(levels):
-            scene_name, parents_name = file_names(index)
-            scene_part, parents_part = part_of(scene_name), part_of(parents_name)
-            write_ply(scene, scene_part)
-            with parents_part.open("wb") as stream:
-                np.save(stream, parents.cpu().numpy())
-            parents_facts = _file_facts(parents_name, parents_part)
-            rows.append({**_file_facts(scene_name, scene_part), "parents": parents_facts, **facts[index]})
+        for index, scene in enumerate(levels):
+            part = part_of(_file_name(index))
+            write_ply(scene, part)
+            file = {"file": _file_name(index), "bytes": part.stat().st_size, "sha256": content_hash(part)}
+            rows.append({**file, **facts[index]})
         if images:
             _draw(images, captions, part_of(FOLDER_FILES.levels_picture))
         write_json({"format": "pointsplat-lod", "version": 1, **about, "levels": rows}, manifest)
         for name in (FOLDER_FILES.levels, *(() if images else (FOLDER_FILES.levels_picture,))):
             (folder / name).unlink(missing_ok=True)
+
+
+def _file_name(index: int) -> str:
+    return f"level_{index}.ply"
 
 
 def _draw(images: Sequence[Tensor], captions: Sequence[str], path: Path) -> None:
@@ -105,7 +99,3 @@ def _draw(images: Sequence[Tensor], captions: Sequence[str], path: Path) -> None
         axis.set_yticks([])
         axis.set_xlabel(caption, fontsize=12)
     figure.savefig(path, dpi=100, format="png")
-
-
-def _file_facts(name: str, path: Path) -> dict[str, Any]:
-    return {"file": name, "bytes": path.stat().st_size, "sha256": content_hash(path)}

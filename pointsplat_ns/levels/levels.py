@@ -6,7 +6,6 @@ level.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Sequence
@@ -18,22 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.pictures import size_quantiles
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.levels.errors import (
-    Displacement,
-    RenderErrors,
-    displacement,
-    far_references,
-    median_depth,
-)
+from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth
 from pointsplat_ns.levels.folder import write_levels
-from pointsplat_ns.levels.stream import Chunks, write_stream
+from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
@@ -52,13 +44,9 @@ class Level:
 
     scene: Gaussians
     """K Gaussians."""
-    parents: Tensor  # [M] int32, index in ``scene`` of the parent of each Gaussian of the level before; -1 if dropped
+    assignment: Tensor  # [N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped
     dropped: int
     """Number of Gaussians of the dense scene without a place in this level, because they are too faint to be drawn."""
-    displacement: Displacement
-    """Distances by which merging moved the centres of the dense scene's Gaussians, scene units."""
-    median_size: float
-    """Median of the Gaussians' largest standard deviations, scene units."""
     errors: RenderErrors | None
     """Errors of its renders against the dense scene's; None if there is no view."""
     seconds: float
@@ -72,9 +60,6 @@ class Level:
             "share": len(self.scene) / whole,
             "sh_degree": self.scene.sh_degree,
             "dropped": self.dropped,
-            "median_size": self.median_size,
-            "displacement": dataclasses.asdict(self.displacement),
-            "mse": near and near.error,
             "psnr": near and near.psnr,
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
@@ -91,7 +76,7 @@ class Levels:
         >>> levels = ps.lod(ps.example_room()[::20], ["50%", "10%"])
         >>> [len(level.scene) for level in levels]
         [1572, 314]
-        >>> whole = levels.assignment(1)  # index in the second level, for each Gaussian of the dense scene
+        >>> whole = levels[1].assignment  # index in the second level, for each Gaussian of the dense scene
         >>> len(whole), int(whole.max())
         (3143, 313)
     """
@@ -119,9 +104,16 @@ class Levels:
         return [level.scene for level in self]
 
     @property
-    def errors(self) -> list[RenderErrors | None]:
-        """The errors of each level's renders."""
-        return [level.errors for level in self]
+    def parents(self) -> list[Tensor]:
+        """For each level but the last, the index (M,) int64 in the next of the parent of each Gaussian; -1 if it is
+        dropped."""
+        found = []
+        for finer, coarser in zip(self.levels, self.levels[1:], strict=False):
+            parents = torch.full((len(finer.scene),), -1, dtype=torch.int64, device=finer.assignment.device)
+            kept = finer.assignment >= 0
+            parents[finer.assignment[kept]] = coarser.assignment[kept]
+            found.append(parents)
+        return found
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -131,13 +123,6 @@ class Levels:
 
     def __iter__(self) -> Iterator[Level]:
         return iter(self.levels)
-
-    def assignment(self, index: int) -> Tensor:
-        """Index (N,) int64 in the level at ``index`` for each Gaussian of ``dense``; -1 if dropped."""
-        *finer, last = (level.parents.long() for level in self.levels[: range(len(self))[index] + 1])
-        for parents in reversed(finer):
-            last = _parents_of_parents(parents, last)
-        return last
 
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write every level, the manifest and the picture to a folder, as ``pointsplat lod`` does.
@@ -149,21 +134,18 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        levels = [(level.scene, level.parents) for level in self]
-        write_levels(folder, levels, *self._manifest(), *self._picture(), force)
+        write_levels(folder, self.scenes, *self._manifest(), *self._picture(), force)
 
     def save_stream(
         self,
         folder: str | Path,
         force: bool = False,
-        chunks: Chunks | None = None,
         progress: Progress = silent,
         page: StreamPage | None = None,
     ) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
-        parents = [level.parents for level in self.levels[1:]]
-        return write_stream(folder, self.scenes, parents, chunks, force, progress, page)
+        return write_stream(folder, self.scenes, self.parents, force, progress, page)
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
@@ -302,11 +284,9 @@ def make_levels(
         notes = (views.text, *notes)
     farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
-    before = torch.arange(len(dense), device=dense.device, dtype=torch.int64)  # [N] index in the level before
     start = time.perf_counter()
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
-        parents = _parents(before, merged.assignment, len(made[-1].scene) if made else len(dense))
         errors = None
         if reference is not None:
             what = f"measuring level {len(made)} of {len(counts) - 1}"
@@ -315,28 +295,11 @@ def make_levels(
         made.append(
             Level(
                 scene=merged.scene,
-                parents=parents,
+                assignment=merged.assignment,
                 dropped=int((merged.assignment < 0).sum()),
-                displacement=displacement(dense, merged.scene, merged.assignment),
-                median_size=size_quantiles(merged.scene)[1],
                 errors=errors,
                 seconds=seconds,
             )
         )
-        before = merged.assignment
         start = time.perf_counter()
     return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
-
-
-def _parents(finer: Tensor, coarser: Tensor, count: int) -> Tensor:
-    """Parent (count,) int32 of each Gaussian of a level in the next coarser level, from the assignments (N,) to both;
-    -1 if dropped."""
-    parents = torch.full((count,), -1, dtype=torch.int32, device=finer.device)
-    kept = finer >= 0
-    parents[finer[kept]] = coarser[kept].int()
-    return parents
-
-
-def _parents_of_parents(parents: Tensor, further: Tensor) -> Tensor:
-    """Indices (M,) of the parents of parents; -1 where dropped."""
-    return torch.where(parents >= 0, further[parents.clamp_min(0)], -1)

@@ -6,58 +6,30 @@ coarsest one. Where two leaves of different levels meet, nothing is drawn twice 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
+from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pages.stream_page import StreamPage, page_files
+from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLOATS, INDICES
-
-
-@dataclass(frozen=True)
-class Chunks:
-    """Sizes of the pieces of a stream."""
-
-    count: int = 1 << 19
-    """Gaussians of the finest level in a leaf, at most, and in a file that gets no further leaf."""
-    extent: float | None = None
-    """Largest side of a leaf, scene units; by default an eighth of the diagonal of the content."""
-    least: int = 8192
-    """Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry for a
-    leaf, and viewers choose a level for each, so that leaves of few Gaussians cost more than they save."""
-
-    def __post_init__(self) -> None:
-        if self.count < 1 or (self.extent is not None and not self.extent > 0):
-            raise BudgetError(f"chunks of {self.count} Gaussians and {self.extent} units; expected positive numbers")
-
-
-def check_stream_folder(folder: Path, force: bool, page: Iterable[str] = ()) -> None:
-    """Raise SceneError if a stream, and the files of its page, may not be written to a folder, which need not exist."""
-    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
-        raise SceneError(f"{folder}: a stream is several files; expected the name of a folder")
-    for name in (STREAM_META, *page):
-        if (folder / name).exists() and not force:
-            raise SceneError(f"{folder / name}: exists already; name another folder, or overwrite it with --force")
 
 
 def write_stream(
     folder: Path | str,
     levels: Sequence[Gaussians],
     parents: Sequence[Tensor],
-    chunks: Chunks | None = None,
     force: bool = False,
     progress: Progress = silent,
     page: StreamPage | None = None,
@@ -69,10 +41,9 @@ def write_stream(
         levels: the finest first.
         parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
             that are too faint to be drawn, which are left out.
-        chunks: sizes of the pieces.
         force: whether an existing stream may be overwritten.
         progress: called while encoding.
-        page: written beside it; the levels are turned as it says. By default the page of an older stream is removed.
+        page: written beside it; the levels are turned as it says.
 
     Returns:
         The number of Gaussians written of each level.
@@ -82,33 +53,40 @@ def write_stream(
     """
     folder = Path(folder)
     files = {} if page is None else page.files
-    check_stream_folder(folder, force, files)
+    check_folder(folder, (STREAM_META, *files), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
     if page is not None and page.turn is not None:
         scenes = [page.turn.apply(scene) for scene in scenes]
     if scenes:
         warn_of_losses(format_to_write(SOG_META), scenes[0], folder)
-    sizes = chunks or Chunks()
-    tree = partition(scenes, [of.cpu().long() for of in parents], sizes)
+    most = 1 << 19
+    tree = partition(scenes, [of.cpu().long() for of in parents], most)
     with ExitStack() as stack:
         for name, data in files.items():
             stack.enter_context(replacing(folder / name, len(data))).write_bytes(data)
-        counts = write_sog_stream(scenes, tree, folder / STREAM_META, sizes.count, progress)["counts"]
-        for file in page_files(folder):
-            file.unlink()
+        counts = write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]
     return counts
 
 
-def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Chunks) -> Node:
-    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton order; for the arguments
-    see :func:`write_stream`."""
+def partition(
+    levels: Sequence[Gaussians], parents: Sequence[Tensor], most: int, extent: float | None = None, least: int = 8192
+) -> Node:
+    """A tree whose leaves hold the descendants of neighbours in the coarsest level, in Morton order.
+
+    Args:
+        levels, parents: as of :func:`write_stream`.
+        most: Gaussians of the finest level in a leaf, at most.
+        extent: largest side of a leaf, scene units; by default an eighth of the diagonal of the content.
+        least: Gaussians of the finest level in a leaf, up to which it is not cut for its extent. The tree has one entry
+            for a leaf, and viewers choose a level for each, so that leaves of few Gaussians cost more than they save.
+    """
     coarsest = levels[-1]
     ancestors = [torch.arange(len(coarsest), **INDICES)]
     for of in reversed(parents):
         ancestors.insert(0, torch.where(of >= 0, ancestors[0][of.clamp_min(0)], -1))
     kept = ancestors[0] >= 0
     weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
-    extent = content_size(coarsest)[1] / 8 if chunks.extent is None else chunks.extent
+    extent = content_size(coarsest)[1] / 8 if extent is None else extent
     leaf_of = torch.empty(len(coarsest), **INDICES)
     leaves = 0
 
@@ -117,8 +95,8 @@ def partition(levels: Sequence[Gaussians], parents: Sequence[Tensor], chunks: Ch
         points, weight = coarsest.means[members], weights[members]
         total = int(weight.sum())
         sides = points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3, **FLOATS)
-        too_wide = float(sides.max()) > extent and total > chunks.least
-        if len(members) > 1 and (total > chunks.count or too_wide):
+        too_wide = float(sides.max()) > extent and total > least
+        if len(members) > 1 and (total > most or too_wide):
             order = points[:, int(sides.argmax())].argsort(stable=True)
             half = int((weight[order].cumsum(0) < total / 2).sum()) + 1
             cut = min(max(half, 1), len(members) - 1)

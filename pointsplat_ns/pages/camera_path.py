@@ -23,7 +23,7 @@ from pointsplat_ns.io.files import logger, one_line, require_file
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.pages.trajectories import along, fitted, toured, walk
+from pointsplat_ns.pages.trajectories import along, fitted, toured
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
@@ -36,14 +36,10 @@ class PathSettings:
     """Frames a second."""
     photo_side: int = 960
     """Largest longer side of pictures from the poses of photos, without a given size, pixels."""
-    bytes: int = 64_000_000
-    """Maximum size of a file: nerfstudio writes about 500 bytes a frame."""
     frames: int = 100_000
     """Maximum number of cameras."""
     pixels: int = 16_384
     """Maximum width and height of a picture."""
-    coordinate: float = 1e9
-    """Largest coordinate of a camera, scene units: its square is finite in float32."""
 
 
 CAMERA_PATH = PathSettings()
@@ -112,37 +108,31 @@ def camera_path(
     known = source.known(CAMERA_PATH.frames)
     if saved is not None:
         path = read_path(saved)
-        fps = settings.fps or path.fps or CAMERA_PATH.fps
+        fps = settings.fps or path.fps
         frames = 1 if one else len(path.views) if settings.seconds is None else _frames(settings.seconds, fps)
         views = _sized(path.views, settings, (path.views.width, path.views.height))
         if known is not None:
             views = dataclasses.replace(views, background=known.background, rasterize_mode=known.rasterize_mode)
-        return CameraPath(views if frames == len(views) else along(views, frames), fps, f"the path of {saved}")
+        return CameraPath(views if frames == len(views) else along(views, frames), fps, path.origin)
     fps = settings.fps or CAMERA_PATH.fps
     frames = 1 if one else _frames(10.0 if settings.seconds is None else settings.seconds, fps)
     if known is None:
         opening = opening_views(scene, 1 if one else VIEW_COUNTS.walked, *_shape(settings, (960, 540)), up)
         stops = opening.views[[*range(len(opening.views)), 0]] if opening.whole else toured(opening.views)
         origin = f"{'around' if opening.whole else 'past'} what shows most, up is {opening.up}{source.missing}"
-        return CameraPath(walk(stops, frames, opening.up.direction), fps, origin)
+        return CameraPath(along(stops, frames, opening.up.direction), fps, origin)
     if settings.seconds is None and not one:
         frames = max(frames, len(known))
-    usual = (known.width, known.height) if source.given is not None else _reduced(known)
+    usual = known if source.given is not None else known.resized(CAMERA_PATH.photo_side)
     if one:
         known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
-    views = along(_sized(known, settings, usual), frames)
+    views = along(_sized(known, settings, (usual.width, usual.height)), frames)
     skipped = f", {len(known) - frames} of {len(known)} left out" if frames < len(known) and not one else ""
     return CameraPath(views, fps, f"along the {source.origin}{skipped}")
 
 
 def _frames(seconds: float, fps: float) -> int:
     return min(max(round(seconds * fps), 1), CAMERA_PATH.frames)
-
-
-def _reduced(views: Views) -> tuple[int, int]:
-    """Width and height of photos, their longer side at most 960 pixels."""
-    factor = min(1.0, CAMERA_PATH.photo_side / max(views.width, views.height))
-    return round(views.width * factor), round(views.height * factor)
 
 
 def _sized(views: Views, settings: FilmSettings, usual: tuple[int, int]) -> Views:
@@ -161,22 +151,13 @@ def _shape(settings: FilmSettings, usual: tuple[int, int]) -> tuple[int, int]:
     return max(width - width % 2, 2), max(height - height % 2, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class SavedPath:
-    """A saved camera path."""
-
-    views: Views
-    """One camera for each frame, float64, with a black background."""
-    fps: float | None
-    """Frames a second; None if the file does not say."""
-
-
-def read_path(path: Path | str) -> SavedPath:
+def read_path(path: Path | str) -> CameraPath:
     """Read a camera path: JSON with ``camera_path``, ``render_width`` and ``render_height``, as nerfstudio's viewer
-    saves it. Raises SceneError if there is no such file, and DataError if it is too large, is not such JSON, has
-    another camera model, or has an invalid camera."""
+    saves it. Cameras are float64, over black; without a speed there are 24 frames a second. Raises SceneError if there
+    is no such file, and DataError if it is too large, is not such JSON, has another camera model, or has an invalid
+    camera."""
     path = require_file(path, "a camera path saved by nerfstudio's viewer (JSON)")
-    if path.stat().st_size > CAMERA_PATH.bytes:
+    if path.stat().st_size > 64_000_000:  # nerfstudio writes about 500 bytes a frame
         raise DataError(f"{path}: {path.stat().st_size / 1e6:.0f} MB; expected a camera path of at most 64 MB")
     try:
         content = json.loads(path.read_text("utf-8"))
@@ -197,7 +178,7 @@ def read_path(path: Path | str) -> SavedPath:
     Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
     fps = finite(content.get("fps"))
     views = Views(viewmats_from_opengl(torch.stack(poses)), Ks, width, height, torch.zeros(3, **FLOATS))
-    return SavedPath(views, fps if fps is not None and 0 < fps <= 1000 else None)
+    return CameraPath(views, fps if fps is not None and 0 < fps <= 1000 else CAMERA_PATH.fps, f"the path of {path}")
 
 
 def _size(value: Any, name: str, path: Path) -> int:
@@ -220,11 +201,8 @@ def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, f
     rigid = (off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)  # nerfstudio writes 16 digits
     if not bool(rigid):  # NaN fails too
         raise DataError(f"{path}: the pose of camera {index} is no rigid motion; expected a rotation and a position")
-    if float(pose[:3, 3].abs().max()) > CAMERA_PATH.coordinate:
-        raise DataError(
-            f"{path}: camera {index} is farther than {CAMERA_PATH.coordinate:g} units from the origin; expected it "
-            "nearer"
-        )
+    if float(pose[:3, 3].abs().max()) > 1e9:  # its square is finite in float32
+        raise DataError(f"{path}: camera {index} is farther than 1e+09 units from the origin; expected it nearer")
     fov = finite(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:
         raise DataError(f"{path}: fov of camera {index} is {str(camera.get('fov'))[:40]}; expected 0.1 to 179 degrees")

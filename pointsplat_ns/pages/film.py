@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -14,10 +13,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer.constants import TILE
-from pointsplat_ns.rasterizer.drawing import Drawing
-from pointsplat_ns.rasterizer.rendering import QualityName
-from pointsplat_ns.rasterizer.tiles import Region
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import View, Views
 
 if TYPE_CHECKING:
@@ -27,73 +23,32 @@ if TYPE_CHECKING:
 SplitScreen = Literal["side-by-side", "wipe"]
 
 
-@dataclass(frozen=True, eq=False)
-class FilmScenes:
-    """Scenes of a film, and their layout in the picture."""
-
-    first: Gaussians
-    second: Gaussians | None = None
-    split: SplitScreen = "side-by-side"
-    labels: Sequence[str] = ()
-    """Labels of the first and the second scene; may be empty."""
-
-
-def render_frames(film: FilmScenes, views: Views, fps: float) -> Iterator[np.ndarray]:
-    """Draw the frames (H, W, 3) uint8 of a film; twice as wide as the views if two scenes are side by side."""
+def render_frames(
+    scenes: Sequence[Gaussians],
+    views: Views,
+    fps: float,
+    split: SplitScreen = "side-by-side",
+    labels: Sequence[str] = (),
+) -> Iterator[np.ndarray]:
+    """Draw the frames (H, W, 3) uint8 of a film of one scene or two. Two have ``labels``, unless these are empty."""
     for index, view in enumerate(views):
-        yield render_frame(film, view, index / fps)
+        if len(scenes) > 1 and split == "wipe":
+            # The line moves 0.4 of the width to one side of the middle, to the other side, and back within 6 s.
+            column = round((0.5 + 0.4 * math.sin(2 * math.pi * index / fps / 6.0)) * view.width)
+            pixels = wiped(scenes, view, column)
+        else:
+            column = view.width
+            with torch.no_grad():
+                beside = np.concatenate([to_uint8(render(scene, view)) for scene in scenes], axis=1)
+            pixels = with_line(beside, column)
+        yield with_labels(pixels, labels, column) if labels else pixels
 
 
 @torch.no_grad()
-def render_frame(film: FilmScenes, view: View, seconds: float = 0.0) -> np.ndarray:
-    """Draw one frame (H, W, 3) uint8; the time places the line of a wipe."""
-    if film.second is not None and film.split == "wipe":
-        # The line moves 0.4 of the width to one side of the middle, to the other side, and back within 6 s.
-        at = 0.5 + 0.4 * math.sin(2 * math.pi * seconds / 6.0)
-        column = round(at * view.width)
-        pictures = [Wipe(film.first, film.second, view, column)]
-    else:
-        scenes = [film.first] if film.second is None else [film.first, film.second]
-        pictures = [Wipe(scene, None, view) for scene in scenes]
-        column = view.width
-    pixels = np.concatenate([to_uint8(picture.draw(0, picture.rows)) for picture in pictures], axis=1)
-    if film.second is not None:
-        pixels = with_line(pixels, column)
-    return with_labels(pixels, film.labels, column) if film.labels else pixels
-
-
-class Wipe:
-    """The picture of one or two scenes in one view: the first left of a column (in pixels, from 0 to the view's width),
-    the second, if there is one, from there on. Hidden parts of a scene are not drawn."""
-
-    def __init__(
-        self,
-        first: Gaussians,
-        second: Gaussians | None,
-        view: View,
-        column: int = 0,
-        quality: QualityName = "exact",
-    ):
-        self.column = view.width if second is None else min(max(column, 0), view.width)
-        """First column of the second scene, pixels."""
-        self._first = Drawing(first, view, quality) if self.column > 0 else None
-        self._second = None
-        if second is not None and self.column < view.width:
-            self._second = Drawing(second, view, quality)
-        self.rows = -(-view.height // TILE)
-        """Rows of tiles of 8 pixels."""
-
-    def draw(self, top: int, bottom: int) -> Tensor:
-        """Rows ``top`` to ``bottom`` - 1 of tiles, colours in [0, 1]: (h, width, 3)."""
-        parts = []
-        if self._first is not None:
-            end = -(-self.column // TILE)
-            parts.append(self._first.draw(Region(top, bottom, 0, end))[:, : self.column])
-        if self._second is not None:
-            begin = self.column // TILE
-            part = self._second.draw(Region(top, bottom, begin, self._second.columns))
-            parts.append(part[:, self.column - begin * TILE :])
-        return torch.cat(parts, dim=1)
+def wiped(scenes: Sequence[Gaussians], view: View, column: int) -> np.ndarray:
+    """The picture (H, W, 3) uint8 of one scene, or of two: the first left of a column, a line, and the second."""
+    first, *others = (to_uint8(render(scene, view)) for scene in scenes)
+    return with_line(np.concatenate([first[:, :column], others[0][:, column:]], axis=1), column) if others else first
 
 
 def to_uint8(picture: Tensor) -> np.ndarray:

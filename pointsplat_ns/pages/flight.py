@@ -22,7 +22,7 @@ from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up, known_up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.pruning import need_usable, ply_bytes
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
@@ -71,10 +71,9 @@ class FlightFrame:
         return encode_spz(placed[near], progress, level=level)
 
     def packed(self, scene: Gaussians, name: str, progress: Progress = silent) -> dict[str, str]:
-        """A scene for the page: its name, text on its size, and its data in units of the content as base64 of SPZ."""
+        """A scene for the page: its name, its count, and its data in units of the content as base64 of SPZ."""
         spz = base64.b64encode(self.encoded(scene, name, progress)).decode("ascii")
-        megabytes = ply_bytes(len(scene), scene.sh_degree) / 1e6
-        return {"name": name, "amount": f"{len(scene):,} Gaussians, {megabytes:.2f} MB as .ply", "spz": spz}
+        return {"name": name, "amount": f"{len(scene):,} Gaussians", "spz": spz}
 
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
         """Data for ``flight.js``, from results of :meth:`packed` for one or two scenes; the first is on the left."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
@@ -88,15 +89,13 @@ def write_page(
 
         included = [packed(name, scene) for name, scene in zip(names, scenes, strict=True)]
         missing = ""
-        while True:
-            flight = frame.data(included)
-            text = page(
-                "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, title=title, notes=notes,
-                missing=missing, flight=flight, data={"flight": flight}, live=False, drops=(),
-            ).encode("utf-8")  # fmt: skip
-            if len(text) <= 1e6 * limit_mb:
-                break
-            included, missing = _without_the_largest(included, path, len(text), limit_mb)
+        while len(text := _html(frame.data(included), title, notes, missing)) > 1e6 * limit_mb:
+            excess = f"the page would have {len(text) / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
+            if len(included) == 1:
+                raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
+            largest = max(included, key=lambda scene: len(scene["spz"]))
+            included.remove(largest)
+            missing = f"{largest['name']} is left out: with it {excess}"
             logger.warning("%s: %s", path, missing)
     with replacing(path) as part:
         part.write_bytes(text)
@@ -109,13 +108,9 @@ def check_limit(limit_mb: float) -> None:
         raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
 
 
-def _without_the_largest(
-    included: list[dict[str, str]], path: Path, size: int, limit_mb: float
-) -> tuple[list[dict[str, str]], str]:
-    """The scenes without the largest, and a line of text on the largest. Raises PointSplatError if there is only
-    one."""
-    excess = f"the page would have {size / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
-    if len(included) == 1:
-        raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
-    largest = max(included, key=lambda scene: len(scene["spz"]))
-    return [scene for scene in included if scene is not largest], f"{largest['name']} is left out: with it {excess}"
+def _html(flight: dict[str, Any], title: str, notes: Sequence[str], missing: str) -> bytes:
+    text = page(
+        "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, title=title, notes=notes, missing=missing,
+        flight=flight, data={"flight": flight}, live=False, drops=(),
+    )  # fmt: skip
+    return text.encode("utf-8")

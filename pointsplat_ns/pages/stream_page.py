@@ -9,21 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import smallest_turn
-from pointsplat_ns.io.files import open_inside
 from pointsplat_ns.io.formats import STREAM_META
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.pages.flight import FlightFrame, eyes_of
-from pointsplat_ns.pages.web_viewer import WebViewer, WebViewerPackage, known_digests
+from pointsplat_ns.pages.web_viewer import filled
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
 
@@ -40,11 +37,13 @@ class StreamPage:
     """Text on the up direction."""
 
 
-def stream_page(viewer: WebViewer, scene: Gaussians, known: Views | None, up: Up | None, title: str) -> StreamPage:
+def stream_page(
+    viewer: Mapping[str, bytes], scene: Gaussians, known: Views | None, up: Up | None, title: str
+) -> StreamPage:
     """The page of a scene's stream. It opens upright, with the view that shows most.
 
     Args:
-        viewer: its files.
+        viewer: its files, see :func:`~pointsplat_ns.pages.web_viewer.web_viewer`.
         scene: N Gaussians, not turned.
         known: views that people took, if there are any; see :meth:`~pointsplat_ns.pages.flight.FlightFrame.of`.
         up: which way is up; by default the scene's own, that of the views, or estimated.
@@ -63,47 +62,7 @@ def stream_page(viewer: WebViewer, scene: Gaussians, known: Views | None, up: Up
     bootstrap = {"generator": "pointsplat-ns", "contentUrl": f"./{STREAM_META}", "settings": _settings(frame, turn)}
     named = str(frame.up).replace("(a guess)", "(a guess; --up names another axis)")
     note = f"the page: up is {named}" + (", turned to -y as viewers show it" if turned else "")
-    return StreamPage(turn, viewer.page(title, bootstrap), note)
-
-
-def page_files(folder: Path) -> list[Path]:
-    """The files of the page that was written to a folder, ``index.html`` first; none if there is no page of ours."""
-    files = [folder / name for name in WebViewerPackage().members.values()]
-    try:
-        with files[0].open("rb") as stream:
-            ours = b'id="sse-bootstrap">{"generator":"pointsplat-ns"' in stream.read(1 << 16)
-    except OSError:
-        return []
-    return [file for file in files if file.is_file()] if ours else []
-
-
-_WORDS = {"pointsplat-ns", f"./{STREAM_META}", "still", "none", "step", "animTrack"}
-"""All texts among the values that a page of ours starts with."""
-
-
-def own_page(folder: Path) -> dict[str, bytes]:
-    """The files of the page in a folder, ``index.html`` first, if they are those that :func:`stream_page` makes of the
-    known viewer, or of the one that the environment names; else none. A stranger's folder may hold any script under
-    these names."""
-    package, files = WebViewerPackage(), {}
-    try:
-        for name in package.members.values():
-            with open_inside(folder, folder / name) as stream:
-                files[name] = stream.read(package.largest)
-        page = WebViewer(files)
-        ours = page.digests() == known_digests() and _is_plain(page.bootstrap())
-    except (OSError, ValueError, RecursionError, PointSplatError):
-        return {}
-    return files if ours else {}
-
-
-def _is_plain(value: Any) -> bool:
-    """Whether values that a page starts with are such as :func:`stream_page` gives it: numbers, and known words."""
-    if isinstance(value, dict):
-        return all(map(_is_plain, value.values()))
-    if isinstance(value, list):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, (bool, int, float)) or value in _WORDS
+    return StreamPage(turn, filled(viewer, title, bootstrap), note)
 
 
 def _settings(frame: FlightFrame, turn: Similarity | None) -> dict[str, Any]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -14,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import lack_of_room, one_line, replacing
+from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.outputs import LOCK_NAME
 
 Kind = Literal["video", "frames", "picture"]
@@ -77,35 +75,24 @@ def _write_png(pixels: np.ndarray, path: Path) -> None:
 
 
 def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
-    with _folder_replacing(folder) as part:
-        count = 0
-        for pixels in frames:
-            _write_png(pixels, part / f"frame_{count:05d}.png")
-            count += 1
-    return count
-
-
-@contextmanager
-def _folder_replacing(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder``. Its files replace those in ``folder`` if the block ends without an error;
-    else it is removed."""
-    part: Path | None = None
+    """Write frames to a temporary folder beside ``folder``, whose frames they replace once all are there."""
+    beside = folder.absolute().parent
     try:
-        folder.absolute().parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{folder.name[:40]}.", dir=folder.absolute().parent))
-        yield part
-        folder.mkdir(exist_ok=True)
-        for old in folder.iterdir():
-            if _FRAME.fullmatch(old.name) and not (part / old.name).exists():
-                old.unlink()
-        for new in sorted(part.iterdir()):
-            new.replace(folder / new.name)
+        beside.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=beside) as part:
+            count = 0
+            for pixels in frames:
+                _write_png(pixels, Path(part) / f"frame_{count:05d}.png")
+                count += 1
+            folder.mkdir(exist_ok=True)
+            for old in folder.iterdir():
+                if _FRAME.fullmatch(old.name) and not (Path(part) / old.name).exists():
+                    old.unlink()
+            for new in sorted(Path(part).iterdir()):
+                new.replace(folder / new.name)
     except OSError as error:
-        why = error.strerror or one_line(error)
-        raise SceneError(f"{folder}: cannot be written ({why}{lack_of_room(error, part)})") from error
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
+        raise SceneError(f"{folder}: cannot be written ({error.strerror or one_line(error)})") from error
+    return count
 
 
 def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:

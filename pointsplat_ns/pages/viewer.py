@@ -7,6 +7,7 @@ import io
 import json
 import math
 import shlex
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
@@ -17,39 +18,29 @@ from typing import Any
 
 import torch
 
-from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.pages.film import Wipe, to_uint8, with_line
+from pointsplat_ns.pages.film import wiped
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.kept import Level, Levels
-from pointsplat_ns.pages.server import READABLE_NAMES, Answer, Request, Route, Served, Server, received
+from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import View
 
+READABLE_NAMES = (
+    *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt", ".pth", ".zip",
+)  # fmt: skip
+"""Ends of the names of files that may be dropped."""
 
-@dataclass(frozen=True)
-class ViewerSettings:
-    """Limits of the viewer."""
-
-    most_pages: int = 8
-    """Largest number of pages that get pictures; the one that asked least recently gives way."""
-    wait_seconds: float = 2.0
-    """Longest wait of a page's request for a merged scene; then the page asks again."""
-    end_seconds: float = 5.0
-    """Longest wait for each thing that is being drawn, merged or read when the viewer is closed."""
-    largest_side: int = 4096
-    """Largest longer side of a picture, pixels."""
-    largest_file: int = 4_000_000_000
-    """Largest file that may be dropped, bytes."""
-
-
-VIEWER = ViewerSettings()
+LARGEST_FILE = 4_000_000_000
+"""Largest file that may be dropped, bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +88,7 @@ class _Stage:
     def view(self, wanted: dict[str, Any]) -> View:
         """The view that a page asks for. Errors are those of Python if it is not what the page of this server sends."""
         camera, views = wanted["camera"], self.frame.views
-        width, height = (min(max(int(wanted[name]), 1), VIEWER.largest_side) for name in ("width", "height"))
+        width, height = (min(max(int(wanted[name]), 1), 4096) for name in ("width", "height"))
         eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
         turn, unit = torch.stack([right, down, ahead]), self.frame.size / UNITS
         if not bool(((turn @ turn.T - torch.eye(3, **DOUBLES)).abs() < 1e-3).all()):
@@ -108,28 +99,19 @@ class _Stage:
         K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], **DOUBLES)
         return View(viewmat, K, width, height, views.background, views.rasterize_mode, views.near_plane * unit)
 
-    @torch.no_grad()
-    def picture(self, wanted: dict[str, Any], outdated: Callable[[], bool]) -> bytes:
-        """The picture that a page asks for, as JPEG; empty once it is outdated. A quick one is drawn with fewer
-        Gaussians. Errors as of :meth:`view`."""
+    def picture(self, wanted: dict[str, Any]) -> bytes:
+        """The picture that a page asks for, as JPEG. A quick one is drawn with fewer Gaussians. Errors as of
+        :meth:`view`."""
         from PIL import Image
 
         view, quick = self.view(wanted), bool(wanted["quick"])
         kept = [levels.at(_percent(share)) for levels, share in zip(self.levels, wanted["kept"], strict=True)]
         if len(kept) == 1 and kept[0] is not self.levels[0].whole:
             kept.append(self.levels[0].whole)
-        first, *others = [level.light if quick else level.scene for level in kept]
+        scenes = [level.light if quick else level.scene for level in kept]
         column = round(min(max(float(wanted["wipe"]), 0.0), 1.0) * view.width)
-        drawing = Wipe(first, others[0] if others else None, view, column, "fast" if quick else "exact")
-        # At least 32,768 pixels between two checks for a moved camera.
-        bands, rows = [], max(32_768 // (8 * view.width), 1)
-        for top in range(0, drawing.rows, rows):
-            if outdated():
-                return b""
-            bands.append(drawing.draw(top, min(top + rows, drawing.rows)))
-        pixels, stream = to_uint8(torch.cat(bands)), io.BytesIO()
-        shown = with_line(pixels, drawing.column) if others else pixels
-        Image.fromarray(shown).save(stream, format="JPEG", quality=75 if quick else 95)
+        stream = io.BytesIO()
+        Image.fromarray(wiped(scenes, view, column)).save(stream, format="JPEG", quality=75 if quick else 95)
         return stream.getvalue()
 
     def close(self, timeout: float) -> None:
@@ -138,7 +120,7 @@ class _Stage:
             levels.close(timeout)
 
 
-class Viewer(Served):
+class Viewer:
     """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
     ``with`` block.
 
@@ -158,38 +140,46 @@ class Viewer(Served):
     ):
         share_freed_memory()  # each request has a thread
         self._up, self._read = up, read
-        self._looks: dict[str, int] = {}
-        """Number of each page's newest picture; the page that asked last is the last."""
-        self._drawing, self._encoding, self._dropping = threading.Lock(), threading.Lock(), threading.Lock()
+        self._working, self._dropping = threading.Lock(), threading.Lock()
         self._stage: _Stage | None = None
         routes = {
             "/": Route(self._page),
             "/scene": Route(self._of_stage(self._scene), 1_024),
-            "/picture": Route(self._of_stage(self._picture), 65_536),
+            "/picture": Route(self._of_stage(self._picture), 4_096),
         }
         if read is not None:
-            routes["/drop"] = Route(self._drop, VIEWER.largest_file)
+            routes["/drop"] = Route(self._drop, LARGEST_FILE)
         if scenes:
             self._show(scenes)
         self._server = Server(host, port, routes)
         self.url = self._server.url
+        """Address of the page."""
 
     @property
     def origin(self) -> str:
         """Text on the origin of the first view; empty without a scene."""
         return "" if self._stage is None else self._stage.origin
 
+    def wait(self) -> None:
+        """Wait until Ctrl-C."""
+        threading.Event().wait()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """End the server and all drawing. A second call does nothing."""
         if self._server.fileno() < 0:
             return
         self._server.close()
-        self._looks.clear()
         # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
-        for lock in (self._drawing, self._encoding, self._dropping):
-            lock.acquire(timeout=VIEWER.end_seconds)
+        for lock in (self._working, self._dropping):
+            lock.acquire(timeout=5.0)  # s
         if self._stage is not None:
-            self._stage.close(VIEWER.end_seconds)
+            self._stage.close(5.0)
 
     def _show(self, scenes: Sequence[ViewedScene]) -> None:
         number = 1 if self._stage is None else self._stage.number + 1
@@ -218,45 +208,39 @@ class Viewer(Served):
         levels = dict(enumerate(stage.levels))[index]
         if not have:
             levels.stop(percent)
-        level = (levels.merged(percent, VIEWER.wait_seconds) if have else None) or levels.at(percent)
+        level = (levels.merged(percent, 2.0) if have else None) or levels.at(percent)
         whole = levels.ready(percent) is level
         headers = {"X-State": json.dumps(stage.state(index, percent, level, whole))}
         if level.how == have or not wanted["spz"]:
             return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
-        with self._encoding:
+        with self._working:
             # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
             level.spz = level.spz or stage.frame.encoded(level.scene, stage.scenes[index].name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
 
     def _picture(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
-        """What a page's camera sees, for browsers that cannot draw; nothing if the camera has moved meanwhile."""
-        client, look = str(wanted["client"]), int(wanted["look"])
-        if not 16 <= len(client) <= 64:
-            raise ValueError("no name of a page")
-        self._looks.pop(client, None)
-        self._looks[client] = look
-        while len(self._looks) > VIEWER.most_pages:
-            self._looks.pop(next(iter(self._looks)), None)
-        with self._drawing:
+        """What a page's camera sees, for browsers that cannot draw."""
+        with self._working:
             try:
-                jpeg = stage.picture(wanted, lambda: self._looks.get(client) != look)
+                return Answer(stage.picture(wanted), "image/jpeg")
             except RuntimeError as error:  # too little memory
                 logger.warning("cannot draw: %s", one_line(error))
                 return Answer(status=HTTPStatus.INTERNAL_SERVER_ERROR)
-        return Answer(jpeg, "image/jpeg") if jpeg else Answer(status=HTTPStatus.NO_CONTENT)
 
     def _drop(self, request: Request) -> Answer:
-        """Take a dropped file, and show its scene."""
+        """Take a dropped file, and show its scene. The client's name for it is shown to people. It is no path: only its
+        end is used, if it is one of :data:`READABLE_NAMES`."""
         assert self._read is not None
+        given = request.options["name"]
+        name = "".join(sign if sign.isprintable() else "?" for sign in given.replace("\\", "/").rpartition("/")[2])[:80]
+        suffix = next((suffix for suffix in READABLE_NAMES if given.lower().endswith(suffix)), "")
         with self._dropping, tempfile.TemporaryDirectory(prefix="pointsplat-drop-") as folder:
+            path = Path(folder) / f"scene{suffix}"
             try:
-                path, name = received(request, Path(folder))
-                try:
-                    self._show([self._read(path, name)])
-                except PointSplatError as error:
-                    return _refused(str(error).replace(str(path), name))
+                _receive(request, path, suffix)
+                self._show([self._read(path, name)])
             except PointSplatError as error:
-                return _refused(str(error))
+                return _refused(str(error).replace(str(path), name))
             except (OSError, MemoryError) as error:
                 return _refused(f"the file cannot be read here ({one_line(error)})")
         return Answer(status=HTTPStatus.NO_CONTENT)
@@ -270,6 +254,20 @@ def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
         drops=READABLE_NAMES if drops else (), notes=(), missing="", data={"flight": flight},
     )  # fmt: skip
     return text.encode("utf-8")
+
+
+def _receive(request: Request, path: Path, suffix: str) -> None:
+    """Write the body of a request to a file. Raises SceneError if no scene has such a name, the file is empty, or there
+    is no room for it, and ValueError if the client sends less than it said."""
+    if not suffix:
+        raise SceneError(f"{path}: not a scene; expected a file of {', '.join(READABLE_NAMES)}")
+    if request.length == 0:
+        raise SceneError(f"{path}: an empty file; expected a scene")
+    if shutil.disk_usage(path.parent).free < 1.1 * request.length:
+        raise SceneError(f"{path}: {request.length / 1e6:.0f} MB; the disk here has less room")
+    with path.open("wb") as stream:
+        while data := request.body.read(1 << 20):
+            stream.write(data)
 
 
 def _percent(value: Any) -> int:

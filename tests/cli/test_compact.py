@@ -11,11 +11,12 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import acceptance, trained_refiner
+from pointsplat_ns.compression import acceptance, pictures, trained_refiner
 from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
@@ -79,24 +80,29 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     assert [p.name for p in output.parent.iterdir()] == ["small.ply"]
 
 
-def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, capsys):
-    output, shown = tmp_path / "small.ply", tmp_path / "shown.html"
-    run("compact", ply, "--refiner", helps, "-o", output, "--html", shown)
+def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, capsys, monkeypatch):
+    """It names the files and their sizes, in their formats, and opens as ``pointsplat view`` does."""
+    output, shown = tmp_path / "small.sog", tmp_path / "shown.html"
+    titles: list[str] = []
+    monkeypatch.setattr(pictures, "side_by_side", lambda rows, given, path: titles.extend(given))
+    run("compact", ply, "--refiner", helps, "-o", output, "--html", shown, "--picture", tmp_path / "shown.png")
     said = capsys.readouterr().out
     assert f"{shown}: {bytes_text(shown.stat().st_size)}, to fly through in a browser" in said
     text = shown.read_text("utf-8")
-    psnr = re.search(r"(?m)^refined by the network: [\d.]+ -> ([\d.]+) dB", said)[1]
-    assert f"The compact scene has {psnr} dB PSNR" in text and "<h1>room</h1>" in text
+    quality = re.search(r"(?m)^[\d.]+ dB PSNR against the dense scene .*", said)[0]
+    assert f">{quality}<" in text and "<h1>room</h1>" in text
     flight = parts_of(shown).data["flight"]
-    assert [(scene["name"], scene["amount"].split(",")[0]) for scene in flight["scenes"]] == [
-        ("dense", "150 Gaussians"),
-        ("compact", "75 Gaussians"),
+    files = [f"{path.name}, {bytes_text(path.stat().st_size)}" for path in (ply, output)]
+    assert [(scene["name"], scene["amount"]) for scene in flight["scenes"]] == [
+        (f"dense ({files[0]})", "150 Gaussians"),
+        (f"compact ({files[1]})", "75 Gaussians"),
     ]
-    assert len(flight["views"]) == 6
+    assert [titles[0].splitlines()[-1], titles[-1].splitlines()[-1]] == files
+    assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
     limit = str(shown.stat().st_size / 1e6 - 0.0005)  # a little too small for both
     run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--html-limit", limit, "--force")
-    assert "dense is left out" in shown.read_text("utf-8")
-    assert [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]] == ["compact"]
+    assert " is left out: " in shown.read_text("utf-8")
+    assert [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]] == ["compact (not written)"]
 
 
 def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):

@@ -17,7 +17,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.levels.stream import Chunks, Node, partition
+from pointsplat_ns.levels.stream import Node, partition
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.upright import up_named
@@ -133,12 +133,12 @@ def leaves_of(node: Node) -> list[Node]:
 
 
 def parents_of(levels: ps.Levels) -> list[torch.Tensor]:
-    return [level.parents.long() for level in levels.levels[1:]]
+    return levels.parents
 
 
 def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(levels):
     parents = parents_of(levels)
-    leaves = leaves_of(partition(levels.scenes, parents, Chunks(100)))
+    leaves = leaves_of(partition(levels.scenes, parents, 100))
     assert len(leaves) > 3
     for index, scene in enumerate(levels.scenes):
         rows = torch.cat([leaf.rows[index] for leaf in leaves])
@@ -152,23 +152,17 @@ def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(levels):
 def test_leaves_have_at_most_as_many_gaussians_as_asked_for(levels):
     parents = parents_of(levels)
     largest = int(torch.bincount(parents[1][parents[0][parents[0] >= 0]]).max())  # one family is not cut
-    leaves = leaves_of(partition(levels.scenes, parents, Chunks(50)))
+    leaves = leaves_of(partition(levels.scenes, parents, 50))
     assert max(len(leaf.rows[0]) for leaf in leaves) <= max(50, largest)
-    assert len(leaves_of(partition(levels.scenes, parents, Chunks(400)))) == 1
+    assert len(leaves_of(partition(levels.scenes, parents, 400))) == 1
 
 
 def test_wide_leaves_of_many_gaussians_are_cut(levels):
-    leaves = leaves_of(partition(levels.scenes, parents_of(levels), Chunks(extent=0.5, least=40)))
+    leaves = leaves_of(partition(levels.scenes, parents_of(levels), 400, extent=0.5, least=40))
     for leaf in leaves:
         means = levels[-1].scene.means[leaf.rows[-1]]
         assert len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5
     assert len(leaves) > 3
-
-
-@pytest.mark.parametrize("sizes", [{"count": 0}, {"extent": 0.0}, {"extent": float("nan")}])
-def test_sizes_are_positive(sizes):
-    with pytest.raises(ps.BudgetError, match="positive"):
-        Chunks(**sizes)
 
 
 def test_the_command_writes_the_scene_and_its_levels(tmp_path, capsys):

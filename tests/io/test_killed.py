@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 import pointsplat_ns as ps
 from making import cloud
@@ -29,8 +28,7 @@ base = here = Path(sys.argv[1])
 new, other = (ps.load(base / name) for name in ("new.ply", "other.ply"))
 
 def levels(scene, out):
-    parents = torch.arange(len(scene), dtype=torch.int32)
-    write_levels(out / "lod", [(scene, parents)] * 2, {}, [{}, {}], force=True)
+    write_levels(out / "lod", [scene] * 2, {}, [{}, {}], force=True)
 
 WRITERS = {
     "ply": lambda scene, out: ps.save(scene, out / "a.ply", overwrite=True),
@@ -131,7 +129,7 @@ def write_old(kind: str, out: Path) -> None:
     if kind == "json":
         write_json([30] * 300, out / "a.json")
     elif kind == "levels":
-        write_levels(out / "lod", [(old, torch.arange(30, dtype=torch.int32))], {}, [{}])
+        write_levels(out / "lod", [old], {}, [{}])
     else:
         ps.save(old, out / {"ply": "a.ply", "spz": "a.spz", "sog": "meta.json"}[kind])
 

@@ -24,9 +24,7 @@ from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import Megabytes
-from pointsplat_ns.rasterizer.drawing import Drawing
 from pointsplat_ns.rasterizer.scene import pixels_of
-from pointsplat_ns.rasterizer.tiles import Region
 
 AXIS = "-x"
 """Up in these tests, which no estimate would choose."""
@@ -142,8 +140,6 @@ def test_an_antialiased_scene_is_drawn_so_from_any_view():
     assert torch.equal(ps.render(trained_so(scene), views), wanted)
     assert torch.equal(ps.render(trained_so(scene), antialiased), wanted)
     assert torch.equal(pixels_of(trained_so(scene), views[0]), pixels_of(scene, antialiased[0]))
-    drawing = Drawing(trained_so(scene), views[0])
-    torch.testing.assert_close(drawing.draw(Region(0, 4, 0, 6)), wanted[0], rtol=0, atol=2e-6)
     for by in ("lightgaussian", "pup"):
         kept, expected = (ps.prune(s, 0.5, by, views=v) for s, v in ((trained_so(scene), views), (scene, antialiased)))
         assert same_bits(kept, expected)

@@ -10,7 +10,6 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.levels.stream import Chunks
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import kept as module
 from pointsplat_ns.pages.kept import Level, Levels
@@ -37,7 +36,7 @@ def merged(levels: Levels, percent: int) -> Level:
 
 
 def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp_path, monkeypatch):
-    ps.lod(scene, [1.0, 0.5, 0.1], folder=tmp_path / "room", stream=Chunks())
+    ps.lod(scene, [1.0, 0.5, 0.1], folder=tmp_path / "room", stream=True)
     shown = []
     monkeypatch.setattr("pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
     ps.open_viewer(tmp_path / "room")

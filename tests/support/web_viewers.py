@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from html.parser import HTMLParser
 from typing import Any
 
-from pointsplat_ns.pages.web_viewer import WebViewer, WebViewerPackage
+from pointsplat_ns.pages.web_viewer import WRITTEN_NAMES, WebViewerPackage
 
 INDEX = b"""<!doctype html><html><head><title>Viewer</title>
 <script type="application/json" id="sse-bootstrap">
@@ -45,10 +45,9 @@ def package_of(data: bytes, **changes: Any) -> WebViewerPackage:
     return WebViewerPackage(integrity=base64.b64encode(hashlib.sha512(data).digest()).decode(), **changes)
 
 
-def small_viewer() -> WebViewer:
-    """A viewer of a few bytes, which shows nothing."""
-    names = WebViewerPackage().members
-    return WebViewer({written: MEMBERS[f"package/{name}"] for name, written in names.items()})
+def small_viewer() -> dict[str, bytes]:
+    """The files of a viewer of a few bytes, which shows nothing."""
+    return {written: MEMBERS[f"package/{name}"] for name, written in WRITTEN_NAMES.items()}
 
 
 class _Reader(HTMLParser):

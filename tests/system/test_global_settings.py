@@ -17,7 +17,6 @@ from torch.utils._device import _device_constructors
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
 from pointsplat_ns.compression import repair
-from pointsplat_ns.levels.stream import Chunks
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 from pointsplat_ns.system.native import cpp_files
@@ -140,7 +139,7 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     found["refined"] = ps.refine(found["pruned by paper"], refiner)
     levels = ps.lod(room, ["50%", 60], views=views, folder=folder / "levels")
     found["levels"] = [[level.scene, level.errors] for level in levels]
-    ps.lod(room, ["50%", 60], views=views, folder=folder / "stream", stream=Chunks())
+    ps.lod(room, ["50%", 60], views=views, folder=folder / "stream", stream=True)
     for suffix in (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb"):
         ps.save(room, folder / f"room{suffix}")
         found[suffix] = ps.load(folder / f"room{suffix}")

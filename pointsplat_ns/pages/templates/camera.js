@@ -13,7 +13,7 @@ function turned(vector, axis, angle) {
 }
 
 const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]; // each a quarter turn on
-const NAMES = ["x", "y", "z", "-x", "-y", "-z"];
+const AXIS_NAMES = ["x", "y", "z", "-x", "-y", "-z"];
 const ALONG = 1 - 1e-6; // cosine from which on a direction is an axis
 
 // The directions that may be up: the given one, then the world's axes, from the one after the nearest on.

@@ -7,26 +7,18 @@ function say(text) {
   said.hidden = !text;
 }
 
-function send(file) {
-  const request = new XMLHttpRequest(); // fetch does not say how much has been sent
-  request.open("POST", `/drop?name=${encodeURIComponent(file.name)}`);
-  request.upload.addEventListener("progress", ({ loaded, total }) => {
-    say(loaded < total ? `Reading ${file.name}, ${Math.round((100 * loaded) / total)} %` : `Opening ${file.name} …`);
-  });
-  request.addEventListener("load", () => {
-    if (request.status === 204) location.assign("/");
-    else done(request.responseText || `${file.name} was refused (${request.status}).`);
-  });
-  request.addEventListener("error", () => done("The viewer does not answer, or takes no file of this size."));
+async function send(file) {
   chosen.disabled = true;
-  say(`Reading ${file.name}`);
-  request.send(file);
-}
-
-function done(text) {
+  say(`Opening ${file.name} …`);
+  try {
+    const answer = await fetch(`/drop?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+    if (answer.ok) return location.assign("/");
+    say((await answer.text()) || `${file.name} was refused (${answer.status}).`);
+  } catch {
+    say("The viewer does not answer, or takes no file of this size.");
+  }
   chosen.disabled = false;
   chosen.value = "";
-  say(text);
 }
 
 chosen.addEventListener("change", () => chosen.files.length && send(chosen.files[0]));

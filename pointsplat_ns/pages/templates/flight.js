@@ -160,7 +160,7 @@ class Flight {
   }
 
   sayUp() {
-    const up = this.ups[this.upright], name = NAMES[AXES.findIndex((axis) => dot(axis, up) > ALONG)];
+    const up = this.ups[this.upright], name = AXIS_NAMES[AXES.findIndex((axis) => dot(axis, up) > ALONG)];
     const text = name ? name.padStart(2, "+") : up.map((value) => value.toFixed(2)).join(" ");
     this.part.up.textContent = `up: ${text}${this.upright || this.data.sure ? "" : ", a guess"}`;
     this.part.option.textContent = `--up=${name}`;

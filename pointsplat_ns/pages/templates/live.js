@@ -114,12 +114,12 @@ class Live extends Flight {
     return { state: JSON.parse(answer.headers.get("X-State")), spz: new Uint8Array(await answer.arrayBuffer()) };
   }
 
-  // A picture of what the camera sees; null if it has moved meanwhile.
+  // A picture of what the camera sees; null if there is none.
   async picture(values) {
     try {
       const answer = await this.post("/picture", { ...values, wipe: this.wipe, kept: this.kept });
       this.say("");
-      return answer.status === 200 ? createImageBitmap(await answer.blob()) : null;
+      return await createImageBitmap(await answer.blob());
     } catch (error) {
       this.say(error.message);
       return null;
@@ -135,32 +135,26 @@ class Live extends Flight {
   }
 }
 
-// Draws as Drawer does, with pictures that it asks for: small ones while the camera moves.
+// Draws as Drawer does, with pictures that it asks for, one after the other: small ones while the camera moves.
 class Pictures {
   // Throws the error that says why there is no WebGL if nothing can be shown.
   constructor(canvas, why, ask) {
     this.context = canvas.getContext("2d", { alpha: false });
     if (!this.context) throw why;
     this.ask = ask;
-    this.client = crypto.randomUUID?.() ?? String(Math.random()).padEnd(16, "0");
-    this.look = 0;
   }
 
   remove() {}
 
-  // A quick picture is waited for; a whole one ends when the camera moves.
   async draw(camera, style, parts, detail, moving) {
     const { canvas } = this.context, factor = moving ? Math.min(1, QUICK / Math.max(canvas.width, canvas.height)) : 1;
     const [width, height] = [canvas.width, canvas.height].map((side) => Math.round(side * factor));
     this.wanted = { camera: camera.state, width, height, quick: moving };
-    if (this.asked?.quick) return;
-    while (this.wanted) {
-      const asked = (this.asked = this.wanted);
+    if (this.asked) return;
+    while ((this.asked = this.wanted)) {
       this.wanted = null;
-      const picture = await this.ask({ ...asked, client: this.client, look: ++this.look });
-      if (this.asked !== asked) return;
+      const picture = await this.ask(this.asked);
       if (picture) this.context.drawImage(picture, 0, 0, canvas.width, canvas.height);
     }
-    this.asked = null;
   }
 }

@@ -160,28 +160,22 @@ function makeSorter(positions) {
   };
 }
 
-// Sorts in a worker, or here where a browser lets no worker run. While it is at work, only the latest camera waits.
+// Sorts in a worker. While it is at work, only the latest camera waits.
 class Sorting {
   constructor(positions, onSorted) {
-    this.positions = positions;
     this.onSorted = onSorted;
     this.waiting = null;
     this.working = null;
-    try {
-      const program = `${makeSorter}
-        let sort;
-        onmessage = ({ data }) => {
-          if (data.positions) return void (sort = makeSorter(data.positions));
-          const order = sort(data);
-          postMessage(order, [order.buffer]);
-        };`;
-      this.worker = new Worker(URL.createObjectURL(new Blob([program], { type: "text/javascript" })));
-      this.worker.onmessage = ({ data }) => this.finish(data);
-      this.worker.onerror = () => this.sortHere();
-      this.worker.postMessage({ positions });
-    } catch {
-      this.sortHere();
-    }
+    const program = `${makeSorter}
+      let sort;
+      onmessage = ({ data }) => {
+        if (data.positions) return void (sort = makeSorter(data.positions));
+        const order = sort(data);
+        postMessage(order, [order.buffer]);
+      };`;
+    this.worker = new Worker(URL.createObjectURL(new Blob([program], { type: "text/javascript" })));
+    this.worker.onmessage = ({ data }) => this.finish(data);
+    this.worker.postMessage({ positions });
   }
 
   get busy() {
@@ -195,9 +189,7 @@ class Sorting {
 
   next() {
     [this.working, this.waiting] = [this.waiting, null];
-    if (!this.busy) return;
-    if (this.worker) this.worker.postMessage(this.working);
-    else setTimeout(() => this.finish(this.sorted(this.working)));
+    if (this.busy) this.worker.postMessage(this.working);
   }
 
   finish(order) {
@@ -208,13 +200,7 @@ class Sorting {
 
   end() {
     this.onSorted = () => {};
-    this.worker?.terminate();
-  }
-
-  sortHere() {
-    this.worker = null;
-    this.sorted = makeSorter(this.positions);
-    if (this.busy) this.finish(this.sorted(this.working));
+    this.worker.terminate();
   }
 }
 

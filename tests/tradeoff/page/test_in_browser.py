@@ -161,3 +161,15 @@ def test_the_recommended_scene_is_flown_through_beside_all_else(browser, make_pa
     one(browser, "#stop").send_keys(Keys.END)
     assert shown(browser)["name"] == "dense"
     assert complaints(browser) == []
+
+
+def test_the_page_fits_a_phone_and_its_table_a_laptop(opened):
+    script = """const table = document.querySelector(".scroll");
+      return [document.documentElement.scrollWidth, table.scrollWidth, table.clientWidth]"""
+    found = {}
+    for width, height in ((390, 844), (1280, 900)):
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 1000}
+        opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        found[width] = opened.execute_script(script)
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert found[390][0] == 390 and found[1280][1] == found[1280][2], "no column is cut off"
