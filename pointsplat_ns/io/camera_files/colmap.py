@@ -42,8 +42,13 @@ class _Lens(NamedTuple):
     size: tuple[float, float]
     focal: tuple[float, float]
     centre: tuple[float, float]
-    bent: bool
-    """Whether it has distortion."""
+    model: str
+    distortion: tuple[float, ...]
+
+    @property
+    def bent(self) -> bool:
+        """Whether it has distortion."""
+        return "FISHEYE" in self.model or any(self.distortion)
 
 
 class _Image(NamedTuple):
@@ -104,7 +109,7 @@ def colmap_cameras(path: Path) -> CameraFile:
     lengths = poses[:, :4].norm(dim=1)
     matrices[~((lengths > 1e-6) & (lengths < 1e6))] = torch.nan
     cameras = [
-        Camera(image.name, pose, *lenses[image.camera][:3])
+        Camera(image.name, pose, *lenses[image.camera])
         for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
     ]
     return CameraFile(cameras, Motion(torch.eye(4, **DOUBLES)[:3]))
@@ -112,8 +117,7 @@ def colmap_cameras(path: Path) -> CameraFile:
 
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
     _, focals, _ = COLMAP_CAMERAS[name]
-    bent = "FISHEYE" in name or any(params[focals + 2 :])
-    return _Lens(size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), bent)
+    return _Lens(size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), name, params[focals + 2 :])
 
 
 def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
