@@ -7,9 +7,10 @@ nerfstudio do.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,10 +47,14 @@ class PosedPhotoSettings:
     """Longer side of photos, pixels, if no resolution is asked for, as in 3DGS training."""
     min_likeness: float = 0.5
     """Least mean correlation of renders and their photos."""
+    sure_likeness: float = 0.75
+    """With as much, the world is not turned to find more."""
     searched: int = 4
     """Number of photos that other frames are tried on."""
-    scale_step: float = 1.1
-    """Factor between the scales that are tried."""
+    clear_likeness: float = 0.02
+    """Advantage of a frame over the given one."""
+    scale_steps: tuple[float, ...] = (1.1, 1.01, 1.002)
+    """Factors between the scales that are tried, coarse to fine."""
     same_scale: float = 0.02
     """Deviation of a scale from 1 that is left as it is."""
     outlier_db: float = 6.0
@@ -251,17 +256,20 @@ def _in_frame(dense: Gaussians, named: NamedViews, views: Views, shown: dict[int
         )
 
     poses, words = invert_rigid(views.viewmats), [""]
-    given = fit(poses)
-    if not _fits(given):
-        frames = list(_frames(named, poses))
-        text, best = max(frames, key=lambda frame: fit(frame[1], searched).own)
-        if fit(best).own > given.own:
-            poses, words = best, [text]
-    scale = _best_scale(lambda factor: fit(_scaled(poses, factor)).own)
+    placed, given = poses, fit(poses)
+    found = given
+    for frames, chosen in ((_known_frames, indices), (_turned_frames, searched)):
+        if frames is _turned_frames and found.own >= POSED_PHOTOS.sure_likeness:
+            break
+        text, best = max(frames(named, poses), key=lambda frame: fit(frame[1], chosen).own)
+        other = fit(best)
+        if other.own > found.own + POSED_PHOTOS.clear_likeness:
+            found, words, placed = other, [text], best
+    scale = _best_scale(lambda factor: fit(_scaled(placed, factor)).own)
     if abs(scale - 1) > POSED_PHOTOS.same_scale:
-        poses = _scaled(poses, scale)
-        words.append(f"positions times {scale:.3g}")
-    found = fit(poses)
+        placed = _scaled(placed, scale)
+        words.append(f"positions times {scale:.4g}")
+    found = fit(placed)
     if not _fits(found):
         raise DataError(
             f"{model}: renders of the scene are unlike the photos in the frame of these poses and in all others that "
@@ -276,7 +284,7 @@ def _in_frame(dense: Gaussians, named: NamedViews, views: Views, shown: dict[int
             "poses are moved into the frame of the scene: %s (%.1f -> %.1f dB PSNR in %d small photos)",
             ", ".join(words), given.psnr, found.psnr, found.count,
         )  # fmt: skip
-    return views_of(poses)
+    return views_of(placed)
 
 
 def _fits(found: Likeness) -> bool:
@@ -287,44 +295,54 @@ def _scaled(poses: Tensor, factor: float) -> Tensor:
     return Motion(torch.eye(4, **DOUBLES)[:3], factor).of(poses)
 
 
-def _best_scale(likeness_at) -> float:
-    """The scale of positions with the greatest likeness, by steps uphill from 1 and a parabola at the top."""
-    step, tried = POSED_PHOTOS.scale_step, {}
-
-    def at(power: int) -> float:
-        if power not in tried:
-            tried[power] = likeness_at(step**power)
-        return tried[power]
-
-    power = 0
-    while abs(power) < 48:  # a factor of a hundred
-        best = max((power, power - 1, power + 1), key=at)
-        if best == power:
+def _best_scale(likeness_at: Callable[[float], float]) -> float:
+    """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or, where that is
+    unlike, from the best of a hundredth to a hundred."""
+    scale = 1.0
+    if likeness_at(scale) < POSED_PHOTOS.min_likeness:
+        scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
+    for step in POSED_PHOTOS.scale_steps:
+        at = functools.cache(lambda power, start=scale, step=step: likeness_at(start * step**power))
+        power = 0
+        while abs(power) < 48:
+            best = max((power, power - 1, power + 1), key=at)
+            if best == power:
+                break
+            power = best
+        low, middle, high = at(power - 1), at(power), at(power + 1)
+        bend = low - 2 * middle + high
+        scale *= step ** (power + (0.5 * (low - high) / bend if bend < 0 else 0.0))
+        if abs(scale - 1) <= POSED_PHOTOS.same_scale:
             break
-        power = best
-    low, middle, high = at(power - 1), at(power), at(power + 1)
-    bend = low - 2 * middle + high
-    return step ** (power + (0.5 * (low - high) / bend if bend < 0 else 0.0))
+    return scale
 
 
-def _frames(named: NamedViews, poses: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Poses (C, 4, 4) from camera to world in frames that the scene may have, and what leads there."""
-    starts = [("", poses)]
-    raw = poses if named.motion is None else _undone(named.motion, poses)
+Frame = tuple[str, Tensor]
+"""What leads to a frame, and poses (C, 4, 4) from camera to world in it."""
+
+
+def _known_frames(named: NamedViews, poses: Tensor) -> list[Frame]:
+    """Frames that files tell of, and the one that nerfstudio makes of the poses."""
+    frames = [("", poses)]
+    raw = poses
     if named.motion is not None:
-        starts.append(("without dataparser_transforms.json", raw))
+        raw = _undone(named.motion, poses)
+        frames.append(("without dataparser_transforms.json", raw))
     if named.saved is not None:
-        if not torch.equal(named.saved.transform, torch.eye(4, **DOUBLES)[:3]):
-            starts.append(("applied_transform undone", _undone(named.saved, raw)))
+        frames.append(("applied_transform undone", _undone(named.saved, raw)))
         upright = Motion(torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], **DOUBLES))
         for start in (raw, upright.of(raw)):
-            yield "oriented, centred and scaled as nerfstudio does", _as_nerfstudio(start)
-    for text, start in starts:
-        for flipped in (False, True):
-            for turn in _axis_turns():
-                words = [text, _turn_text(turn), "camera axes y and z turned around" if flipped else ""]
-                turned = Motion(torch.cat([turn, torch.zeros(3, 1, **DOUBLES)], dim=1)).of(start)
-                yield ", ".join(filter(None, words)), flip_camera_axes(turned) if flipped else turned
+            frames.append(("oriented, centred and scaled as nerfstudio does", _as_nerfstudio(start)))
+    return frames
+
+
+def _turned_frames(named: NamedViews, poses: Tensor) -> Iterator[Frame]:
+    """The poses with the world turned by axes, or the camera axes of OpenGL for those of OpenCV, or both."""
+    for turn in _axis_turns():
+        turned = Motion(torch.cat([turn, torch.zeros(3, 1, **DOUBLES)], dim=1)).of(poses)
+        text = _turn_text(turn)
+        yield text, turned
+        yield ", ".join(filter(None, (text, "camera axes y and z turned around"))), flip_camera_axes(turned)
 
 
 def _undone(motion: Motion, poses: Tensor) -> Tensor:
