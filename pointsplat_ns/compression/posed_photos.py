@@ -48,7 +48,7 @@ class PosedPhotoSettings:
     min_likeness: float = 0.5
     """Least mean correlation of renders and their photos."""
     sure_likeness: float = 0.75
-    """With as much, the world is not turned to find more."""
+    """With as much in the given frame, the world is not turned to find more."""
     searched: int = 4
     """Number of photos that other frames are tried on."""
     clear_likeness: float = 0.02
@@ -259,7 +259,7 @@ def _in_frame(dense: Gaussians, named: NamedViews, views: Views, shown: dict[int
     placed, given = poses, fit(poses)
     found = given
     for frames, chosen in ((_known_frames, indices), (_turned_frames, searched)):
-        if frames is _turned_frames and found.own >= POSED_PHOTOS.sure_likeness:
+        if frames is _turned_frames and given.own >= POSED_PHOTOS.sure_likeness:
             break
         text, best = max(frames(named, poses), key=lambda frame: fit(frame[1], chosen).own)
         other = fit(best)
