@@ -11,11 +11,11 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, views_from_within
-from pointsplat_ns.compression import posed_photos as module
 from pointsplat_ns.compression.posed_photos import read_posed_photos
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
 from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.looking import photo_frame as module
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text
 
 COUNT = 18

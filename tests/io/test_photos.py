@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from captures import FRAMES, HEIGHT, WIDTH, OPENCV_TO_OPENGL, Capture, Lens, colors_at, seen_from
+from captures import FRAMES, HEIGHT, OPENCV_TO_OPENGL, WIDTH, Capture, Lens, colors_at, seen_from
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.lenses import lens_of, pixel_map
 from pointsplat_ns.io.camera_files import read_named_views
@@ -95,7 +95,9 @@ def test_beyond_where_a_polynomial_turns_back_no_pixel_is_shown():
     lens = lens_of("SIMPLE_RADIAL", (-0.5,))
     assert lens is not None
     _, shown = pixel_map(lens, K, 80, 60)
-    radii = torch.stack(torch.meshgrid(torch.arange(80) - 39.5, torch.arange(60) - 29.5, indexing="xy"), -1).norm(dim=-1)
+    radii = torch.stack(torch.meshgrid(torch.arange(80) - 39.5, torch.arange(60) - 29.5, indexing="xy"), -1).norm(
+        dim=-1
+    )
     assert not shown[radii / 40 > 0.82].any() and shown[radii / 40 < 0.81].all()
 
 
