@@ -8,6 +8,7 @@ nerfstudio do.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,29 +25,14 @@ from pointsplat_ns.io.camera_files.colmap import model_folder
 from pointsplat_ns.io.files import bytes_text, logger, require_memory
 from pointsplat_ns.io.photos import PhotoReader, photo_files, photos_of_cameras
 from pointsplat_ns.looking.content import thinned
+from pointsplat_ns.looking.photo_frame import in_frame
 from pointsplat_ns.looking.pose_check import POSE_CHECK, likeness
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
 
-
-@dataclass(frozen=True)
-class PosedPhotoSettings:
-    """Settings of reading."""
-
-    least: int = 8
-    """Least number of photos: fewer hold none out."""
-    side: int = 1600
-    """Longer side of photos, pixels, if no resolution is asked for, as in 3DGS training."""
-    outlier_db: float = 6.0
-    """Photos whose PSNR is so much below the median are left out, if that is also"""
-    outlier_deviations: float = 4.0
-    """so many standard deviations, which are estimated from the median deviation."""
-    held_out_every: int = 8
-    """One photo of this many is held out."""
-
-
-POSED_PHOTOS = PosedPhotoSettings()
+LEAST_PHOTOS = 8
+"""Fewer hold none out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +72,7 @@ def read_posed_photos(
     """
     folder = Path(folder)
     model, named, files = _posed_files(folder, poses, scene)
-    side = POSED_PHOTOS.side if resolution is None else max(resolution)
+    side = 1600 if resolution is None else max(resolution)  # as in 3DGS training
     masks = model if model.is_dir() else model.parent
     indices = sorted(files)
     few = [indices[place] for place in spread_indices(len(indices), POSE_CHECK.views)]
@@ -107,15 +93,13 @@ def read_posed_photos(
         more = f" and {len(left_out) - 6} more" if len(left_out) > 6 else ""
         logger.info("photos that fit worst are left out: %s%s", worst, more)
     names = sorted(indices, key=lambda index: named.names[index])
-    held = [index for index in names[:: POSED_PHOTOS.held_out_every] if index not in left_out]
+    held = [index for index in names[::8] if index not in left_out]
     training = [index for index in names if index not in held and index not in left_out]
     logger.info(
         "photos: %d of %s, poses of %s; %d are held out; %s in memory",
         len(examples), folder, model, len(held), bytes_text(sum(_bytes_of(examples[i]) for i in examples)),
     )  # fmt: skip
-    return PosedPhotos(
-        views.resized(side), [examples[index] for index in training], [examples[index] for index in held], model
-    )
+    return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held], model)
 
 
 def _posed_files(
@@ -140,19 +124,19 @@ def _posed_files(
             why = why or str(error)
             continue
         files = photos_of_cameras(folder, names, named)
-        if len(files) >= POSED_PHOTOS.least:
+        if len(files) >= LEAST_PHOTOS:
             if len(files) < len(named.names):
                 logger.info("%s: %d of its %d cameras have no photo in %s", place, len(named.names) - len(files),
                             len(named.names), folder)  # fmt: skip
             return place, named, files
         why = why or (
             f"{place}: {len(files)} of its {len(named.names)} cameras have a photo in {folder}; expected at least "
-            f"{POSED_PHOTOS.least}. Names of cameras: {_two(named.names)}; of photos: {_two(names)}"
+            f"{LEAST_PHOTOS}. Names of cameras: {_two(named.names)}; of photos: {_two(names)}"
         )
     raise DataError(why)
 
 
-def _two(names: list[str]) -> str:
+def _two(names: Sequence[str]) -> str:
     return ", ".join(repr(name[-60:]) for name in names[:2])
 
 
@@ -194,7 +178,8 @@ def _bytes_of(example: Example) -> int:
 
 
 def _outliers(dense: Gaussians, examples: dict[int, Example], progress: Progress) -> dict[int, float]:
-    """PSNR of the photos that fit so much worse than the others that something must be wrong with them, worst first."""
+    """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four standard deviations,
+    estimated from the median deviation. Of ten captures, two photos of one are among them."""
     drawn = thinned(dense, POSE_CHECK.max_count)
     psnrs = {}
     for done, (index, example) in enumerate(examples.items()):
@@ -203,7 +188,7 @@ def _outliers(dense: Gaussians, examples: dict[int, Example], progress: Progress
     values = torch.tensor([*psnrs.values()], **DOUBLES)
     middle = float(values.median())
     deviation = 1.4826 * float((values - middle).abs().median())
-    bound = middle - max(POSED_PHOTOS.outlier_db, POSED_PHOTOS.outlier_deviations * deviation)
+    bound = middle - max(6.0, 4 * deviation)
     return dict(sorted(((index, psnr) for index, psnr in psnrs.items() if psnr < bound), key=lambda pair: pair[1]))
 
 

@@ -2,6 +2,9 @@
 
 Files of cameras have the frame of the data. A scene may have another: nerfstudio and gsplat turn, centre and scale the
 data before they train; programs have different ideas of up, and of the axes of cameras; editors scale scenes.
+
+Thresholds are chosen on the photos of ten captures. Photos and renders correlate by 0.78 to 0.92 in the right frame, by
+at most 0.36 where the world or the cameras are turned by axes, by 0.3 to 0.8 at four fifths of the scale.
 """
 
 from __future__ import annotations
@@ -9,7 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -27,30 +30,11 @@ from pointsplat_ns.looking.pose_check import POSE_CHECK, Likeness, Photo, likene
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
 
+LEAST_LIKENESS = 0.5
+"""Least mean correlation of renders and their photos."""
 
-@dataclass(frozen=True)
-class PhotoFrameSettings:
-    """Settings, chosen on the photos of ten captures. Photos and renders correlate by 0.78 to 0.92 in the right frame,
-    by at most 0.36 where the world or the cameras are turned by axes, by 0.3 to 0.8 at four fifths of the scale. All
-    of them are found again from the frame of the data, turns of axes, and a tenth to three times the scale."""
-
-    least: float = 0.5
-    """Least mean correlation of renders and their photos."""
-    sure: float = 0.75
-    """With as much in the given frame, the world is not turned to find more."""
-    clear: float = 0.02
-    """Advantage of another frame over the given one."""
-    searched: int = 4
-    """Number of photos that turned and scaled frames are tried on."""
-    scale_steps: tuple[float, ...] = (1.1, 1.01, 1.002)
-    """Factors between the scales that are tried, coarse to fine."""
-    same_scale: float = 0.02
-    """Deviation of a scale from 1 that is left as it is."""
-    brighter: float = 1.0
-    """Advantage of a white background over a black one, dB."""
-
-
-PHOTO_FRAME = PhotoFrameSettings()
+SAME_SCALE = 0.02
+"""Deviation of a scale from 1 that is left as it is."""
 
 Frame = tuple[str, Tensor]
 """What leads to a frame, and poses (C, 4, 4) from camera to world in it."""
@@ -76,7 +60,7 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
     search.background = 1.0
     if not _fits(found):
         words, poses = search.best()
-    if (white := search.fit(poses)).psnr > found.psnr + PHOTO_FRAME.brighter and _fits(white):
+    if (white := search.fit(poses)).psnr > found.psnr + 1.0 and _fits(white):
         found = white
         words.append("white background")
     else:
@@ -98,7 +82,7 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
 
 
 def _fits(found: Likeness) -> bool:
-    return found.own >= PHOTO_FRAME.least and found.own - found.others >= POSE_CHECK.min_advantage
+    return found.own >= LEAST_LIKENESS and found.own - found.others >= POSE_CHECK.min_advantage
 
 
 class _Search:
@@ -110,7 +94,7 @@ class _Search:
         self._views = replace(named.views, rasterize_mode="antialiased" if scene.antialiased else "classic")
         self._offset, self._drawn = scene.offset, thinned(scene, POSE_CHECK.max_count)
         self._photos, self._indices = photos, list(photos)
-        self._few = [self._indices[place] for place in spread_indices(len(photos), PHOTO_FRAME.searched)]
+        self._few = [self._indices[place] for place in spread_indices(len(photos), 4)]
         self._known = _known_frames(named, self.poses, model)
 
     def views_of(self, poses: Tensor) -> Views:
@@ -133,14 +117,15 @@ class _Search:
         found = given = self.fit(self.poses)
         words, poses = "", self.poses
         others = [self._known]
-        if given.own < PHOTO_FRAME.sure:
+        if given.own < 0.75:
             others.append([*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])])
         for frames in others:
             text, best = max(frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own)
-            if (other := self.fit(best)).own > found.own + PHOTO_FRAME.clear:
+            if (other := self.fit(best)).own > found.own + 0.02:
                 found, words, poses = other, text, best
-        scale = _best_scale(lambda factor, start=poses: self.fit(_scaled(start, factor)).own)
-        if abs(scale - 1) <= PHOTO_FRAME.same_scale:
+        start = poses
+        scale = _best_scale(lambda factor: self.fit(_scaled(start, factor)).own)
+        if abs(scale - 1) <= SAME_SCALE:
             return [words] if words else [], poses
         return [*filter(None, [words]), f"positions times {scale:.4g}"], _scaled(poses, scale)
 
@@ -153,9 +138,9 @@ def _best_scale(likeness_at: Callable[[float], float]) -> float:
     """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or, where that is
     unlike, from the best of a hundredth to a hundred."""
     scale = 1.0
-    if likeness_at(scale) < PHOTO_FRAME.least:
+    if likeness_at(scale) < LEAST_LIKENESS:
         scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
-    for step in PHOTO_FRAME.scale_steps:
+    for step in (1.1, 1.01, 1.002):
         at = functools.cache(lambda power, start=scale, step=step: likeness_at(start * step**power))
         power = 0
         while abs(power) < 48:
@@ -166,7 +151,7 @@ def _best_scale(likeness_at: Callable[[float], float]) -> float:
         low, middle, high = at(power - 1), at(power), at(power + 1)
         bend = low - 2 * middle + high
         scale *= step ** (power + (0.5 * (low - high) / bend if bend < 0 else 0.0))
-        if abs(scale - 1) <= PHOTO_FRAME.same_scale:
+        if abs(scale - 1) <= SAME_SCALE:
             break
     return scale
 
