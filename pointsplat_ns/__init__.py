@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 _PUBLIC = {
     "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
-    "pointsplat_ns.compression.compact": ("Compacted",),
+    "pointsplat_ns.compression.compacted": ("Compacted",),
     "pointsplat_ns.levels.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.placing": ("place",),
@@ -75,46 +75,12 @@ _PUBLIC = {
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
-    "BudgetError",
-    "Compacted",
-    "DataError",
-    "Gaussians",
-    "Levels",
-    "MissingPackageError",
-    "PointSplatError",
-    "SceneError",
-    "SceneInfo",
-    "SceneResult",
-    "Tradeoff",
-    "TrainedRefiner",
-    "View",
-    "Views",
-    "compact",
-    "compact_folder",
-    "dataset_views",
-    "example_room",
-    "info",
-    "load",
-    "load_refiner",
-    "lod",
-    "lpips",
-    "measure_tradeoff",
-    "open_viewer",
-    "place",
-    "plot_comparison",
-    "plot_distributions",
-    "plot_views",
-    "prune",
-    "psnr",
-    "rasterization",
-    "refine",
-    "render",
-    "render_path",
-    "sample_views",
-    "save",
-    "ssim",
-    "write_page",
-]
+    "BudgetError", "Compacted", "DataError", "Gaussians", "Levels", "MissingPackageError", "PointSplatError",
+    "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "compact",
+    "compact_folder", "dataset_views", "example_room", "info", "load", "load_refiner", "lod", "lpips",
+    "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_distributions", "plot_views", "prune",
+    "psnr", "rasterization", "refine", "render", "render_path", "sample_views", "save", "ssim", "write_page",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
@@ -126,4 +92,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__version__"]

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from pointsplat_ns.compacting import Source, compact_source, goal_of, log, prune_source, read_source
-from pointsplat_ns.compression.compact import Compacted
+from pointsplat_ns.compacting import Looking, Source, compact_source, goal_of, log, prune_source, read_source
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import (
@@ -153,7 +153,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    _, pruned, _, _ = prune_source(scene, request, views, resolution, up, data, progress)
+    _, pruned, _, _ = prune_source(scene, request, Looking(views, resolution, up, data), progress)
     return pruned
 
 
@@ -194,8 +194,7 @@ def compact(
         refiner: from :func:`load_refiner`; by default none.
         by: the method, as for :func:`prune`; by default the method of the refiner's training, or "merge" without a
             refiner.
-        sh: SH bands to keep, as for :func:`prune`.
-        clean: as for :func:`prune`.
+        sh, clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
@@ -207,10 +206,7 @@ def compact(
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
             there are more than twice as many; else it samples views.
-        resolution: as for :func:`prune`.
-        up: as for :func:`prune`.
-        data: as for :func:`prune`.
-        progress: True shows a bar; a function is called with the current task and the share of it that is done.
+        resolution, up, data, progress: as for :func:`prune`.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
@@ -232,7 +228,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos)
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result, _ = compact_source(scene, request, goal, views, resolution, up, data, progress)
+    _, result, _ = compact_source(scene, request, goal, Looking(views, resolution, up, data), progress)
     return result
 
 
@@ -262,14 +258,11 @@ def lod(
         levels: sizes of the levels, as ``keep`` of :func:`prune` except "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
-        resolution: as for :func:`prune`.
-        up: as for :func:`prune`.
-        data: as for :func:`prune`.
+        resolution, up, data, progress: as for :func:`prune`.
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
         stream: sizes of the pieces of a streamed SOG, which is written instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         force: overwrite existing files in ``folder``.
-        progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
         The levels, the finest first, with exactly the requested numbers of Gaussians; their errors, and the parent of
@@ -299,7 +292,7 @@ def lod(
             else:
                 check_stream_folder(Path(folder), force, viewer.files if viewer else ())
             stack.enter_context(claimed_folder(Path(folder)))
-        dense, view_source = read_source(scene, views, resolution, up, data)
+        dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
         page = None
         if viewer is not None and folder is not None:
@@ -329,10 +322,7 @@ def plot_views(
     Args:
         scene: N Gaussians, or the path of a scene.
         path: the PNG file to write.
-        views: as for :func:`prune`.
-        resolution: as for :func:`prune`.
-        up: as for :func:`prune`.
-        data: as for :func:`prune`.
+        views, resolution, up, data: as for :func:`prune`.
 
     Returns:
         Text: the origin of the views, and the share of visible content in the views.
@@ -349,7 +339,7 @@ def plot_views(
         >>> "of the visible content" in text
         True
     """
-    dense, source = read_source(scene, views, resolution, up, data)
+    dense, source = read_source(scene, Looking(views, resolution, up, data))
     return draw_views(dense.detach().to("cpu"), source, path)
 
 

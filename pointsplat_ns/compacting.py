@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,17 +13,17 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sizes import parse_resolution
-from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.compression.requests import Effort
+    from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.targets import Targets
 
 logger = logging.getLogger("pointsplat_ns")
@@ -32,15 +31,33 @@ logger = logging.getLogger("pointsplat_ns")
 Source = Gaussians | str | Path
 """A dense scene, or its path."""
 
-ViewsInput = Views | str | Path | None
-"""Views, the run whose dataset has the poses, a file of cameras, None for those of the scene's run or of a file of
-cameras that lies beside the scene, or "none" for sampled ones."""
 
-ResolutionInput = tuple[int, int] | str | None
-"""Width and height of pictures, pixels."""
+@dataclass(frozen=True, eq=False)
+class Looking:
+    """Options on views, as arguments of :func:`pointsplat_ns.prune`. Raises PointSplatError if the resolution or ``up``
+    is not valid."""
 
-DataInput = str | Path | None
-"""Where the data of a run is now, if it moved: the data itself, or a folder above it."""
+    views: Views | str | Path | None = None
+    """Views, the run whose dataset has the poses, a file of cameras, None for those of the scene's run or of a file of
+    cameras that lies beside the scene, or "none" for sampled ones."""
+    resolution: tuple[int, int] | str | None = None
+    """Width and height of pictures, pixels."""
+    up: str | None = None
+    data: str | Path | None = None
+    """Where the data of a run is now, if it moved: the data itself, or a folder above it."""
+    size: tuple[int, int] | None = field(init=False)
+    """``resolution``, parsed."""
+    upward: Up | None = field(init=False)
+    """``up``, parsed."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", parse_resolution(self.resolution))
+        object.__setattr__(self, "upward", up_named(self.up))
+
+    def run_of(self, scene: Source) -> Path | None:
+        """The file or folder whose dataset may have the poses; None if views are to be sampled."""
+        named = scene if self.views is None else self.views
+        return Path(named) if isinstance(named, (str, Path)) and not without_poses(named) else None
 
 
 @dataclass(frozen=True)
@@ -56,16 +73,9 @@ class Goal:
 
 @normal_mode
 def prune_source(
-    scene: Source,
-    request: PruneRequest,
-    views: ViewsInput = None,
-    resolution: ResolutionInput = None,
-    up: str | None = None,
-    data: DataInput = None,
-    progress: bool | Progress = False,
-    compared: bool = False,
+    scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False, compared: bool = False
 ) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
-    """Read a scene and prune it; notes are logged. Arguments as of :func:`pointsplat_ns.prune`.
+    """Read a scene and prune it; notes are logged.
 
     Returns:
         The dense scene, the smaller scene, the seconds of pruning, and if ``compared`` how close both are; None if
@@ -74,13 +84,12 @@ def prune_source(
     from pointsplat_ns.compression.prune import prune_scene
     from pointsplat_ns.compression.quality import quality_of_pruned
 
-    dense, source = read_source(scene, views, resolution, up, data)
+    dense, source = read_source(scene, looking)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
-        seconds, quality = time.perf_counter() - start, None
-        if compared:
-            quality = quality_of_pruned(dense, pruned, source)
+        seconds = time.perf_counter() - start
+        quality = quality_of_pruned(dense, pruned, source) if compared else None
     log(pruned.notes)
     return dense, pruned.scene, seconds, quality
 
@@ -89,16 +98,13 @@ def prune_source(
 def compact_source(
     scene: Source,
     request: CompactRequest,
-    goal: Goal | None = None,
-    views: ViewsInput = None,
-    resolution: ResolutionInput = None,
-    up: str | None = None,
-    data: DataInput = None,
+    goal: Goal | None,
+    looking: Looking,
     progress: bool | Progress = False,
     compared: bool = False,
 ) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
-    """Read a scene and compact it, or search for a goal; verdicts and notes are logged. Arguments as of
-    :func:`pointsplat_ns.compact`. A search uses only the method and the refiner of the request, and decides the rest.
+    """Read a scene and compact it, or search for a goal; verdicts and notes are logged. A search uses only the method
+    and the refiner of the request, and decides the rest.
 
     Returns:
         The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
@@ -106,23 +112,20 @@ def compact_source(
     """
     from pointsplat_ns.compression.quality import quality_if_seen
 
-    dense, source = read_source(scene, views, resolution, up, data)
+    dense, source = read_source(scene, looking)
     with progress_bar(progress) as report:
         if goal is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if request.photos is None else _training_photos(run_of(scene, None), data)
-            if photos is not None:
-                check_photos(dense, photos, str(scene))
+            photos = None if request.photos is None else _training_photos(dense, scene, looking.data)
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.tradeoff.finding import find_scene
             from pointsplat_ns.tradeoff.measure import subject_of
             from pointsplat_ns.tradeoff.settings import repairs_of
 
-            size, upward = parse_resolution(resolution), up_named(up)
-            run = run_of(scene, views)
-            subject = subject_of(dense, run, source.given, request.refiner, goal.suffix, size, upward, data)
+            run, size, data = looking.run_of(scene), looking.size, looking.data
+            subject = subject_of(dense, run, source.given, request.refiner, goal.suffix, size, looking.upward, data)
             result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
         quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
@@ -130,12 +133,7 @@ def compact_source(
 
 
 def goal_of(
-    request: CompactRequest,
-    keep: object,
-    db: float | None,
-    ms: float | None,
-    mb: float | None,
-    suffix: str,
+    request: CompactRequest, keep: object, db: float | None, ms: float | None, mb: float | None, suffix: str
 ) -> Goal | None:
     """The goal of a search, from a PSNR against the dense scene's renders in dB, the time of a frame in milliseconds
     and the size of a file of a format in units of 10^6 bytes; None if no target is given. Raises BudgetError if a
@@ -147,21 +145,14 @@ def goal_of(
     return None if targets is None else Goal(targets, request.repair.effort, suffix)
 
 
-def read_source(
-    scene: Source,
-    views: ViewsInput,
-    resolution: ResolutionInput,
-    up: str | None = None,
-    data: DataInput = None,
-) -> tuple[Gaussians, ViewSource]:
-    """Read the dense scene, and make its source of views. Arguments as of :func:`pointsplat_ns.prune`. Raises
-    SceneError if a file is missing or damaged, or the scene is a ``pointsplat`` run, which is pruned already; DataError
-    if a file of cameras is not usable, or most of them see nothing of the scene; and PointSplatError if the resolution
-    or ``up`` is not valid."""
-    size, upward = parse_resolution(resolution), up_named(up)
-    if data is not None:
-        from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
+def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]:
+    """Read the dense scene, and make its source of views. Raises SceneError if a file is missing or damaged, or the
+    scene is a ``pointsplat`` run, which is pruned already; and DataError if a file of cameras is not usable, or most of
+    them see nothing of the scene."""
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
 
+    views, data = looking.views, looking.data
+    if data is not None:
         need_named_data(scene if views is None or without_poses(views) else views, data)
     poses: Path | str | None = None if views is None else NO_POSES
     if isinstance(views, (str, Path)) and not without_poses(views):
@@ -175,40 +166,22 @@ def read_source(
         poses = views if is_camera_file(views) else NO_POSES
     dense, found, _ = read_found(scene, poses)
     given = views if isinstance(views, Views) else found
-    read = functools.partial(_dataset_views, data=data)
-    return dense, ViewSource(dense, given, run_of(scene, views), read, size, up=upward)
+    return dense, view_source(dense, given, looking.run_of(scene), data, looking.size, looking.upward)
 
 
-def run_of(scene: Source, views: ViewsInput) -> Path | None:
-    """The file or folder whose dataset may have the poses; None if views are to be sampled."""
-    if without_poses(views):
-        return None
-    named = scene if views is None else views
-    return Path(named) if isinstance(named, (str, Path)) else None
-
-
-def _training_photos(run: Path | None, data: DataInput) -> Photos:
-    """The training photos of a run's dataset.
-
-    Raises:
-        SceneError: if there is no run.
-        DataError: if its data is not found.
-    """
-    if run is None:
+def _training_photos(dense: Gaussians, scene: Source, data: str | Path | None) -> Photos:
+    """The training photos of a run's dataset, which renders of the dense scene are like. Raises SceneError if there is
+    no run, and DataError if its data is not found."""
+    if isinstance(scene, Gaussians):
         raise SceneError("photos are read from the dataset of a run; expected the path of a run")
     from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
 
-    return training_photos(run, data)
+    photos = training_photos(scene, data)
+    check_photos(dense, photos, str(scene))
+    return photos
 
 
 def log(lines: tuple[str, ...]) -> None:
     """Log lines of text at level INFO."""
     for line in lines:
         logger.info("%s", line)
-
-
-def _dataset_views(run: Path | str, data: DataInput = None) -> Views:
-    """The poses of a run's dataset. Read by the plugin, which is not imported before."""
-    from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-
-    return dataset_views(run, data=data)

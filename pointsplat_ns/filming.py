@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,7 +17,7 @@ from pointsplat_ns.io.formats import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, need_named_data
+from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
 from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
 from pointsplat_ns.pages.film import FilmScenes, SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
@@ -193,8 +192,7 @@ def _with_views(scene: Source, views: Views | str | Path | None) -> tuple[Gaussi
 
 
 def _source(scene: Source | None, loaded: Gaussians, given: Views | None, data: str | Path | None = None) -> ViewSource:
-    run = None if isinstance(scene, Gaussians) else scene
-    return ViewSource(loaded, given, run, functools.partial(dataset_views, data=data))
+    return view_source(loaded, given, None if isinstance(scene, Gaussians) else scene, data)
 
 
 def _name(scene: Source, index: int) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +19,7 @@ from pointsplat_ns.io.formats import format_like, format_to_write
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.placing import place
 from pointsplat_ns.pruning import Keep, cut_sh
 from pointsplat_ns.scene_folder import (
@@ -73,14 +73,9 @@ def compact_folder(
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with fewer
             Gaussians than a count is kept whole.
         refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
-        by: as for :func:`compact`.
-        sh: as for :func:`compact`.
-        clean: as for :func:`compact`.
-        effort: as for :func:`compact`.
+        by, sh, clean, effort: as for :func:`compact`.
         seconds: duration of the repair of each scene, as for :func:`compact`.
-        target_db: PSNR that each scene has to reach, as for :func:`compact`.
-        target_ms: as for :func:`compact`.
-        target_mb: as for :func:`compact`, in the format of each result.
+        target_db, target_ms, target_mb: as for :func:`compact`, for each scene in the format of its result.
         resolution: as for :func:`prune`.
         data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
             data is not found gets sampled views, and a note.
@@ -115,34 +110,24 @@ def compact_folder(
     size = parse_resolution(resolution)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
-    options: CommandOptions = {
-        "keep": str(request.prune.budget),
+    compacting = _Compacting(request.prune, size, data, refiner, request.repair)
+    make: Callable[[Gaussians, Path], SmallerScene] = compacting
+    options = {
+        **compacting.options(),
         "refiner": None if trained is None else source_file(trained.source).sha256,
-        "by": request.prune.by,
-        "sh": sh,
-        "clean": clean,
         "effort": effort if seconds is None else None,
         "seconds": seconds,
-        "resolution": None if size is None else size_text(size),
-        **({} if data is None else {"data": str(data)}),
     }
     if targets is not None:
-        options = {**options, "keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
+        options |= {"keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
         make = functools.partial(_found, refiner, targets, request.prune.by, repairs_of(effort), size, data)
-    else:
-        make = functools.partial(_compacted, refiner, replace(request, refiner=None), size, data)
     return run_on_folder(folder, target, Command("compact", make, options), jobs, shard, force, progress)
 
 
 def prune_folder(
     folder: Path,
     output: Path,
-    keep: Keep | str,
-    *,
-    by: str = "merge",
-    sh: str = "all",
-    opacity_weight: float | None = None,
-    clean: bool = False,
+    request: PruneRequest,
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
     jobs: int = 1,
@@ -151,18 +136,9 @@ def prune_folder(
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
     """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
-    request, size = PruneRequest(keep, by, sh, opacity_weight, clean), parse_resolution(resolution)
-    options: CommandOptions = {
-        "keep": str(request.budget),
-        "by": by,
-        "sh": sh,
-        "opacity_weight": opacity_weight,
-        "clean": clean,
-        "resolution": None if size is None else size_text(size),
-        **({} if data is None else {"data": str(data)}),
-    }
-    command = Command("prune", functools.partial(_pruned, request, size, data), options)
-    return run_on_folder(folder, output, command, jobs, shard, force, progress)
+    pruning = _Pruning(request, parse_resolution(resolution), data)
+    options = {**pruning.options(), "opacity_weight": request.opacity_weight}
+    return run_on_folder(folder, output, Command("prune", pruning, options), jobs, shard, force, progress)
 
 
 def convert_folder(
@@ -184,8 +160,10 @@ def convert_folder(
     :func:`compact_folder`. Raises SceneError if the format is not written as one file."""
     if not suffix.startswith(".") or format_to_write(suffix).suffix != suffix:
         raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
-    options: CommandOptions = {"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame}
-    options = options if offset is None else {**options, "offset": str(offset)}
+    options: CommandOptions = {
+        **{"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame},
+        **({} if offset is None else {"offset": str(offset)}),
+    }
     command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame, offset), options, suffix)
     return run_on_folder(folder, output, command, jobs, shard, force, progress)
 
@@ -193,50 +171,58 @@ def convert_folder(
 _loaded = functools.cache(refiner_at)
 
 
-def _compacted(
-    refiner: str | Path | None,
-    request: CompactRequest,
-    resolution: tuple[int, int] | None,
-    data: str | Path | None,
-    dense: Gaussians,
-    path: Path,
-) -> SmallerScene:
-    """Compact one scene of a folder. The request has no refiner, because each process loads its own."""
-    source = _views_of(dense, path, resolution, data)
-    if (whole := _kept_whole(dense, request.prune, source)) is not None:
-        return whole
-    request = replace(request, prune=request.prune.in_format(format_like(path)), refiner=_loaded(refiner))
-    result = compact_scene(dense, request, source)
-    if result.interrupted:
-        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
-    return SmallerScene(result.scene, result.psnr, source.missing[2:-1])
+@dataclass(frozen=True)
+class _Pruning:
+    """Prunes the scenes of a folder. It is pickled for other processes."""
+
+    request: PruneRequest
+    resolution: tuple[int, int] | None
+    data: str | Path | None
+
+    def options(self) -> dict[str, str | float | bool | None]:
+        """All options that a result depends on."""
+        request, size, data = self.request, self.resolution, self.data
+        return {
+            "keep": str(request.budget),
+            "by": request.by,
+            "sh": request.sh,
+            "clean": request.clean,
+            "resolution": None if size is None else size_text(size),
+            **({} if data is None else {"data": str(data)}),
+        }
+
+    def __call__(self, dense: Gaussians, path: Path) -> SmallerScene:
+        """Make one scene smaller. One that has fewer Gaussians than a count is kept whole."""
+        source = view_source(dense, run=path, data=self.data, resolution=self.resolution)
+        request = replace(self.request, suffix=format_like(path).budget_suffix)
+        if isinstance(request.budget, int) and len(dense) < request.budget:
+            note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
+            kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
+            return SmallerScene(kept, None, note, same)
+        scene, psnr = self.smaller(dense, request, source)
+        return SmallerScene(scene, psnr, source.missing[2:-1])
+
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> tuple[Gaussians, float | None]:
+        """The smaller scene, and its PSNR against renders of the dense one, dB."""
+        pruned = prune_scene(dense, request, source)
+        quality = quality_of_pruned(dense, pruned, source)
+        return pruned.scene, None if quality is None else quality.psnr
 
 
-def _views_of(dense: Gaussians, path: Path, resolution: tuple[int, int] | None, data: str | Path | None) -> ViewSource:
-    """The views of one scene of a folder."""
-    read = functools.partial(dataset_views, data=data)
-    return ViewSource(dense, run=path, dataset_views=read, resolution=resolution)
+@dataclass(frozen=True)
+class _Compacting(_Pruning):
+    """Compacts the scenes of a folder."""
 
+    refiner: str | Path | None
+    """Loaded by each process."""
+    repair: RepairBudget
 
-def _kept_whole(dense: Gaussians, request: PruneRequest, source: ViewSource) -> SmallerScene | None:
-    """A scene that has fewer Gaussians than the budget; None for others."""
-    if not isinstance(request.budget, int) or len(dense) >= request.budget:
-        return None
-    note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
-    kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
-    return SmallerScene(kept, None, note, same)
-
-
-def _pruned(
-    request: PruneRequest, resolution: tuple[int, int] | None, data: str | Path | None, dense: Gaussians, path: Path
-) -> SmallerScene:
-    """Prune one scene of a folder."""
-    source = _views_of(dense, path, resolution, data)
-    if (whole := _kept_whole(dense, request, source)) is not None:
-        return whole
-    pruned = prune_scene(dense, request.in_format(format_like(path)), source)
-    quality = quality_of_pruned(dense, pruned, source)
-    return SmallerScene(pruned.scene, None if quality is None else quality.psnr, source.missing[2:-1])
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> tuple[Gaussians, float | None]:
+        """The compact scene, and its PSNR against renders of the dense one, dB."""
+        result = compact_scene(dense, CompactRequest(request, _loaded(self.refiner), self.repair), source)
+        if result.interrupted:
+            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
+        return result.scene, result.psnr
 
 
 def _converted(

@@ -26,24 +26,13 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import (
-    content_hash,
-    json_text,
-    logger,
-    one_line,
-    read_text,
-    replacing,
-    require_memory,
-    write_json,
-)
+from pointsplat_ns.io.files import content_hash, json_text, logger, one_line, read_text, replacing, write_json
 from pointsplat_ns.io.formats import format_like, format_to_read, format_to_write
 from pointsplat_ns.io.scene import read_scene, save_as
-from pointsplat_ns.io.source import source_file, source_parts
+from pointsplat_ns.io.source import source_file
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs
-
-SCENES_FORMAT = "pointsplat-scenes"
 
 Status = Literal["done", "done before", "failed", "open"]
 
@@ -223,7 +212,7 @@ def _check_and_describe(output: Path, command: Command, force: bool) -> None:
     if output.exists() and not output.is_dir():
         raise SceneError(f"{output}: is a file; expected the name of a folder")
     path = output / FOLDER_FILES.scenes
-    description = {"format": SCENES_FORMAT, "command": command.name, "options": dict(command.options)}
+    description = {"format": "pointsplat-scenes", "command": command.name, "options": dict(command.options)}
     try:
         with claim(output / FOLDER_FILES.scenes_lock, wait=True):
             try:
@@ -262,24 +251,21 @@ def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -
             if not held:
                 return None
             shutil.rmtree(task.unfinished, ignore_errors=True)  # of a killed process
-            for part in source_parts(task.source):
-                require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
             text = json.dumps([source_file(task.source).sha256, dict(command.options)], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)
-            if record is None or not _is_as_written(task, record):
-                if os.path.lexists(task.output) and not force:
-                    raise SceneError(
-                        f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
-                        "name another folder, or overwrite it with --force"
-                    )
-                record = None
-            if record is None or record["key"] != key:
+            whole = record is not None and task.output.is_file() and content_hash(task.output) == record["sha256"]
+            if not whole and os.path.lexists(task.output) and not force:
+                raise SceneError(
+                    f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
+                    "name another folder, or overwrite it with --force"
+                )
+            if record is not None and whole and record["key"] == key:
+                result = _result_in(task, record)
+            else:
                 dense = read_scene(task.source)
                 made = command.make(dense, task.source)
                 result = _write(task, len(dense), made, {"key": key, "options": dict(command.options)}, start)
-            else:
-                result = _result_in(task, record)
             task.lock.unlink(missing_ok=True)  # the next process to get the lock finds the scene finished
             return result
     except Exception as error:  # one scene must not stop the others
@@ -337,11 +323,6 @@ def _read_record(task: SceneTask) -> dict[str, Any] | None:
     figures = [record.get(name) for name in ("before", "after", "megabytes", "psnr", "seconds")]
     numbers = all(value is None or (isinstance(value, (int, float)) and abs(value) < 1e18) for value in figures)
     return record if texts and numbers else None
-
-
-def _is_as_written(task: SceneTask, record: Mapping[str, Any]) -> bool:
-    """Whether a result is there and unchanged."""
-    return task.output.is_file() and content_hash(task.output) == record["sha256"]
 
 
 def _result_in(task: SceneTask, record: Mapping[str, Any]) -> SceneResult:

@@ -54,7 +54,7 @@ class View:
     eps2d: float = EPS2D  # pixels^2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Views:
     """C pinhole cameras of one image size and their rendering settings.
 
@@ -104,6 +104,9 @@ class Views:
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
+
+    def __repr__(self) -> str:
+        return f"Views({len(self)} of {self.width} x {self.height} pixels, {self.rasterize_mode})"
 
     @overload
     def __getitem__(self, index: int) -> View: ...

@@ -4,6 +4,7 @@ import doctest
 import inspect
 import logging
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,20 @@ def test_every_public_name_is_documented_with_an_example_that_runs(name):
     assert examples
 
 
+def test_dir_lists_the_public_names_alone():
+    assert sorted(name for name in dir(ps) if not name.startswith("_")) == sorted(ps.__all__)
+
+
+def test_views_are_shown_in_one_short_line():
+    views = ps.sample_views(ps.example_room(), 3, width=64, height=48)
+    assert repr(views) == "Views(3 of 64 x 48 pixels, classic)"
+
+
+def test_render_says_what_it_expects_for_views():
+    with pytest.raises(TypeError, match=r"views is 3; expected a View or Views, such as sample_views\(scene, 3\)"):
+        ps.render(ps.example_room()[:3], 3)
+
+
 # rasterization documents its arguments where gsplat does: beside each in the signature.
 FUNCTIONS = [name for name in ps.__all__ if inspect.isfunction(getattr(ps, name)) and name != "rasterization"]
 
@@ -74,7 +89,8 @@ def test_every_public_function_documents_its_arguments_and_has_types(name):
     text, signature = inspect.getdoc(function) or "", inspect.signature(function)
     for parameter in signature.parameters.values():
         assert parameter.annotation is not inspect.Parameter.empty, f"{name}({parameter.name})"
-        assert f" {parameter.name}: " in text or f", {parameter.name}: " in text, f"{name}({parameter.name})"
+        # several arguments may share a line: "views, resolution: as for prune"
+        assert re.search(rf"\b{parameter.name}(, \w+)*: ", text), f"{name}({parameter.name})"
     assert signature.return_annotation is not inspect.Signature.empty
 
 

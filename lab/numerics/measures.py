@@ -21,7 +21,8 @@ from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.participants import Participants
 from pointsplat_ns.merging.state import initial_state
-from pointsplat_ns.pruning.scores import log_volume_score, paper_score
+from pointsplat_ns.pruning.baselines import log_volume_score
+from pointsplat_ns.pruning.paper import paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.rasterizer import rasterization, rasterize_reference
 from pointsplat_ns.refiner import Refiner

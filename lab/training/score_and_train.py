@@ -14,7 +14,7 @@ import tyro
 
 import pointsplat_ns as ps
 from lab.common.printing import start
-from pointsplat_ns.compacting import read_source
+from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.compression.photo_repair import photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PhotoBudget, PruneRequest
@@ -54,7 +54,7 @@ def main(
         keep: number of Gaussians.
         output: the PLY to write.
     """
-    dense, views = read_source(run, None, None)
+    dense, views = read_source(run, Looking())
     pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, training_photos(run), views, budget)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -35,7 +35,7 @@ from pointsplat_ns.cli.scene_options import (
 )
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compact import Compacted
+    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
     from pointsplat_ns.gaussians import Gaussians
 
@@ -141,7 +141,7 @@ def compact(
             shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
-    from pointsplat_ns.compacting import compact_source, goal_of
+    from pointsplat_ns.compacting import Looking, compact_source, goal_of
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
@@ -152,12 +152,13 @@ def compact(
     claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     kind = format_to_write(output)
-    request = CompactRequest.of(_loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos)
-    request = replace(request, prune=request.prune.in_format(kind))
+    request = CompactRequest.of(
+        _loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos, kind.budget_suffix
+    )
     goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
-            scene, request, goal, poses, resolution, up, data, progress=True, compared=True
+            scene, request, goal, Looking(poses, resolution, up, data), progress=True, compared=True
         )
     if not dry_run:
         ps.save(result.scene, output, progress=True)

@@ -101,7 +101,7 @@ def prune(
         json_output: print the result as JSON, and nothing else on standard output.
     """
     import pointsplat_ns as ps
-    from pointsplat_ns.compacting import prune_source
+    from pointsplat_ns.compacting import Looking, prune_source
     from pointsplat_ns.compression.prune_file import rows_to_prune
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.errors import SceneError
@@ -116,15 +116,15 @@ def prune(
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
-            keep=keep, by=by, sh=sh, opacity_weight=opacity_weight, clean=clean, resolution=resolution,
-            data=data, shard=shard, force=force,
+            request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data, shard=shard,
+            force=force,
         )  # fmt: skip
     need_no_folder_options(scene, None, shard)
     check_poses(poses)
     output = output or output_beside(scene, "pruned")
     written = None if dry_run else output
     claim_outputs(written, force, plot)
-    request = PruneRequest(keep, by, sh, opacity_weight, clean).in_format(format_to_write(output))
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, format_to_write(output).budget_suffix)
     rows = rows_to_prune(scene, request, None if memory is None else 1e6 * memory)
     if rows is not None:
         if dry_run or plot is not None:
@@ -135,7 +135,7 @@ def prune(
     need_no_folder_options(scene, jobs, shard)
     with fixed_threads(threads):
         dense, small, seconds, quality = prune_source(
-            scene, request, poses, resolution, up, data, progress=True, compared=True
+            scene, request, Looking(poses, resolution, up, data), progress=True, compared=True
         )
     if not dry_run:
         ps.save(small, output, progress=True)

@@ -11,14 +11,14 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pointsplat_ns.compression.compact import Compacted
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.looking.closeness import Closeness
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.pruning.scores import log_volume
+from pointsplat_ns.pruning.paper import log_volume
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import spread_indices

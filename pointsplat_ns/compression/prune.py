@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.requests import PruneRequest
-from pointsplat_ns.errors import BudgetError, DataError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
@@ -24,11 +24,9 @@ from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
     Megabytes,
     WithinPsnr,
-    check_size,
     cut_sh,
     energy_lost,
     need_usable,
-    prune,
     score_of,
     select,
 )
@@ -63,19 +61,16 @@ def prune_scene(
     """Make a scene smaller, by default with sampled views. Its numbers are rounded for the size of a
     compressed file, unless ``rounding`` is False. Raises BudgetError if the budget cannot be met, SceneError if no
     Gaussian of the scene can be drawn, and DataError if views are needed and there are none."""
-    if len(dense) == 0:
-        raise BudgetError(f"keep is {request.keep} but the scene holds no Gaussians; expected at least one")
     need_usable(dense)
     views = views or ViewSource(dense)
-    full, notes = _with_sh(dense, request.sh, views, progress)
+    full, about_sh = _with_sh(dense, request.sh, views, progress)
     count = request.count_of(len(full), full.sh_degree, full.traits)
-    start, cleaning, limit, seen = full, None, None, None
+    start, cleaning, limit, seen, searched = full, None, None, None, ""
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene
 
         cleaning = clean_scene(dense, count or 1, views, progress)
         start = cleaning.apply(full, count or 1)
-        notes = [*notes, *cleaning.notes]
     report = functools.partial(progress, f"by {request.by}")
     scored = functools.partial(views.scored, VIEW_COUNTS.scored)
     merging = request.method.score is None
@@ -84,7 +79,7 @@ def prune_scene(
         logger.debug("%s", merged.finish.note)
         scene, seen = merged.scene, merged.views
     elif count is not None:
-        scene = prune(start, count, request.by, scored, request.opacity_weight, report)
+        scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
     else:
         merger = Merger(start, views.for_merging()) if merging else None
         make = _selector(start, request, scored, report) if merger is None else lambda k: merger.merged(k).scene
@@ -92,22 +87,22 @@ def prune_scene(
             make = _refilling(make, cleaning, full, len(start))
         searching = functools.partial(progress, "trying counts")
         if isinstance(request.budget, Megabytes):
-            scene, limit, note = _for_size(dense, start, make, request.budget, views, searching)
+            scene, limit, searched = _for_size(dense, start, make, request.budget, views, searching)
         else:
-            scene, limit, note = _for_psnr(dense, make, request.budget, views, searching)
-        notes = [*notes, note]
+            scene, limit, searched = _for_psnr(dense, make, request.budget, views, searching)
         seen = None if merger is None else merger.views
-    if views.origin:
-        notes.insert(0, views.text)
     if limit is not None and rounding:
         scene = limit.rounded(scene)
-    return Pruned(scene, tuple(notes), seen, limit)
+    about_views = views.text if views.origin else ""
+    about_junk = () if cleaning is None else cleaning.notes
+    notes = tuple(note for note in (about_views, about_sh, *about_junk, searched) if note)
+    return Pruned(scene, notes, seen, limit)
 
 
-def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, list[str]]:
-    """The scene with the SH bands that ``sh`` keeps, and a line on them unless it keeps all."""
+def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, str]:
+    """The scene with the SH bands that ``sh`` keeps, and a line on them; an empty one if it keeps all."""
     if sh == "all":
-        return dense, []
+        return dense, ""
     reached = ""
     if sh == "auto":
         from pointsplat_ns.compression.budget_search import needed_sh_degree
@@ -119,10 +114,10 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -
     else:
         degree = int(sh)
     if degree >= dense.sh_degree:
-        return dense, [f"SH degree {dense.sh_degree} kept"]
+        return dense, f"SH degree {dense.sh_degree} kept"
     lost = 100 * energy_lost(dense, degree)
     cut = f"SH degree {dense.sh_degree} cut to {degree}"
-    return cut_sh(dense, degree), [f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}"]
+    return cut_sh(dense, degree), f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}"
 
 
 def _selector(
@@ -185,7 +180,7 @@ def _for_size(
     ``start`` is the largest scene allowed, ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, largest_within
 
-    limit = FileLimit(format_to_write(budget.suffix), check_size(budget, len(dense)))
+    limit = FileLimit(format_to_write(budget.suffix), budget.bytes)
     try:
         reference = DenseReference(dense, views.compared())
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])

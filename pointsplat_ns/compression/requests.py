@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.pruning import (
     Keep,
-    Megabytes,
     Method,
-    WithinPsnr,
-    check_size,
     found_by_trying,
     method_named,
     parse_keep,
     resolve_keep,
 )
-from pointsplat_ns.pruning.methods import check_opacity_weight
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-    from pointsplat_ns.io.formats import Format
 
 SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 """Values of the option ``sh``."""
@@ -119,36 +114,25 @@ class PruneRequest:
     clean: bool = False
     """Whether to remove Gaussians that no picture needs first (:mod:`~pointsplat_ns.compression.cleaning`). ``keep``
     still refers to the dense scene, and the result has exactly that number of Gaussians."""
+    suffix: str = ".ply"
+    """Suffix of the format that a size or a PSNR in the text ``keep`` is for, if it names none."""
     budget: Keep = field(init=False)
     """``keep``, parsed if it is text."""
+    method: Method = field(init=False)
+    """The method called ``by``."""
 
     def __post_init__(self) -> None:
-        check_opacity_weight(self.method, self.opacity_weight)
+        object.__setattr__(self, "method", method_named(self.by, self.opacity_weight))
         if self.sh not in SH_CHOICES:
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
-        budget = parse_keep(self.keep) if isinstance(self.keep, str) else self.keep
-        if isinstance(budget, WithinPsnr) and not 0 < budget.value < math.inf:
-            raise BudgetError(f"the wanted PSNR is {budget.value} dB; expected a positive number, such as 35")
+        budget = parse_keep(self.keep, self.suffix) if isinstance(self.keep, str) else self.keep
         object.__setattr__(self, "budget", budget)
-
-    def in_format(self, kind: Format) -> PruneRequest:
-        """The request for files of a format. A size or a PSNR in ``keep`` that names no format is for it."""
-        return replace(self, keep=parse_keep(self.keep, kind.budget_suffix)) if isinstance(self.keep, str) else self
-
-    @property
-    def method(self) -> Method:
-        """The method called ``by``."""
-        return method_named(self.by)
 
     def count_of(self, n: int, sh_degree: int, traits: Traits = PLAIN) -> int | None:
         """Number of Gaussians to keep of ``n``, which depends on the SH degree and traits of the result where it has
         to fit a file; None if it needs a search (a PSNR, or the size of a compressed file). Raises BudgetError if the
         budget does not fit the scene."""
-        if not found_by_trying(self.budget):
-            return resolve_keep(n, self.budget, sh_degree, traits)
-        if isinstance(self.budget, Megabytes):
-            check_size(self.budget, n)
-        return None
+        return None if found_by_trying(self.budget) else resolve_keep(n, self.budget, sh_degree, traits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +157,7 @@ class CompactRequest:
         clean: bool = False,
         repair: RepairBudget = RepairBudget("instant"),
         photos: bool = False,
+        suffix: str = ".ply",
     ) -> CompactRequest:
         """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
         without a refiner, a tenth and merging. With ``photos``, a number of seconds is for the steps on
@@ -182,7 +167,7 @@ class CompactRequest:
             usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
         by = usual_by if by is None else by
         weight = weight if method_named(by).weighs_opacity else None
-        prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean)
+        prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean, suffix)
         if not photos:
             return cls(prune, refiner, repair)
         trained = PhotoBudget(repair.effort, repair.seconds)

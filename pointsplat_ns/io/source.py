@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import content_hash, one_line
+from pointsplat_ns.io.files import content_hash, one_line, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_read
 from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run
@@ -29,6 +29,8 @@ def source_file(path: Path | str) -> SourceFile:
     """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. Raises
     SceneError if there is none, or it cannot be read."""
     parts = source_parts(path)
+    for part in parts:
+        require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
     if len(parts) > 1 or parts[0].name == SOG_META:
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
         hashes = "".join(f"{part.relative_to(folder).as_posix()} {content_hash(part)}\n" for part in parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,9 +15,12 @@ from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.posed_scene import check_photos
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
+from pointsplat_ns.looking.upright import Up
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.third_party_warnings import import_nerfstudio
 from pointsplat_ns.views import Views, spread_indices
 
@@ -53,6 +57,19 @@ def dataset_views(path: Path | str, split: Split = "train", data: Path | str | N
 expected a nerfstudio run
     """
     return _views_of(*_open(path, split, data), split)
+
+
+def view_source(
+    scene: Gaussians,
+    given: Views | None = None,
+    run: Path | str | None = None,
+    data: Path | str | None = None,
+    resolution: tuple[int, int] | None = None,
+    up: Up | None = None,
+) -> ViewSource:
+    """The source of a scene's views: given ones, those of a run's dataset, else sampled ones; arguments as of
+    :class:`~pointsplat_ns.looking.view_source.ViewSource` and :func:`dataset_views`."""
+    return ViewSource(scene, given, run, functools.partial(dataset_views, data=data), resolution, up)
 
 
 def dataset_photos(

@@ -5,13 +5,12 @@ from pointsplat_ns.pruning.budget import (
     Keep,
     Megabytes,
     WithinPsnr,
-    check_size,
     found_by_trying,
     parse_keep,
     resolve_keep,
 )
 from pointsplat_ns.pruning.methods import METHODS, Method, PruneSettings, method_named, need_usable, prune, score_of
-from pointsplat_ns.pruning.select import select
+from pointsplat_ns.pruning.paper import select
 from pointsplat_ns.pruning.sh_bands import band_energies, cut_sh, energy_lost
 
 __all__ = [
@@ -22,7 +21,6 @@ __all__ = [
     "PruneSettings",
     "WithinPsnr",
     "band_energies",
-    "check_size",
     "cut_sh",
     "energy_lost",
     "found_by_trying",

@@ -22,7 +22,8 @@ KEEP_FORMS = (
 
 @dataclass(frozen=True)
 class Megabytes:
-    """A budget: the largest size of the file, in units of 10^6 bytes."""
+    """A budget: the largest size of the file, in units of 10^6 bytes. Raises BudgetError if it is not positive, or the
+    format is not written."""
 
     value: float
     suffix: str = ".ply"
@@ -32,6 +33,13 @@ class Megabytes:
         kind = format_named(self.suffix)
         if kind is None or kind.write is None:
             raise BudgetError(f"keep is the size of a {self.suffix} file; expected one of {WRITABLE}")
+        if not 0 < self.value < math.inf:  # NaN fails too
+            raise BudgetError(f"keep is {self}; {KEEP_FORMS}")
+
+    @property
+    def bytes(self) -> int:
+        """The largest size, bytes."""
+        return math.floor(self.value * 1e6)
 
     @property
     def bytes_of(self) -> Callable[[int, int, Traits], int] | None:
@@ -44,11 +52,16 @@ class Megabytes:
 
 @dataclass(frozen=True)
 class WithinPsnr:
-    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own."""
+    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own. Raises BudgetError
+    if it is not positive."""
 
     value: float
     suffix: str = ".ply"
     """Suffix of the file format, for which numbers are rounded."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.value < math.inf:  # NaN fails too
+            raise BudgetError(f"the wanted PSNR is {self.value} dB; expected a positive number, such as 35")
 
     def __str__(self) -> str:
         return f"auto:{self.value:g}" + (self.suffix if self.suffix != ".ply" else "")
@@ -92,12 +105,12 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
         keep = parse_keep(keep)
     if isinstance(keep, WithinPsnr):
         raise BudgetError("keep is auto, which is found by rendering; expected a ratio, a count or a size here")
-    if isinstance(keep, Megabytes):
-        return _count_that_fits(n, keep, sh_degree, traits)
-    if isinstance(keep, bool) or not isinstance(keep, Real):
+    if isinstance(keep, bool) or not isinstance(keep, (Megabytes, Real)):
         raise BudgetError(f"keep is {keep!r}; {KEEP_FORMS}")
     if n < 1:
-        raise BudgetError(f"keep is {keep!r} but the scene holds no Gaussians; expected at least one")
+        raise BudgetError(f"keep is {keep} but the scene holds no Gaussians; expected at least one")
+    if isinstance(keep, Megabytes):
+        return _count_that_fits(n, keep, sh_degree, traits)
     if isinstance(keep, Integral):
         if not 1 <= keep <= n:
             raise BudgetError(f"keep is {int(keep)} Gaussians; expected 1 to {n}, the number in the scene")
@@ -117,28 +130,15 @@ def found_by_trying(keep: Keep) -> bool:
     return isinstance(keep, WithinPsnr) or isinstance(keep, Megabytes) and keep.bytes_of is None
 
 
-def check_size(keep: Megabytes, n: int) -> int:
-    """The bytes of a budget for a scene of ``n`` Gaussians.
-
-    Raises:
-        BudgetError: if it is no positive number, or the scene is empty.
-    """
-    if not 0 < keep.value < math.inf:
-        raise BudgetError(f"keep is {keep}; {KEEP_FORMS}")
-    if n < 1:
-        raise BudgetError(f"keep is {keep} but the scene holds no Gaussians; expected at least one")
-    return math.floor(keep.value * 1e6)
-
-
 def _count_that_fits(n: int, keep: Megabytes, sh_degree: int, traits: Traits) -> int:
     """Largest number of Gaussians, at most ``n``, whose file is no larger than the budget."""
-    bytes_of, limit = keep.bytes_of, check_size(keep, n)
+    bytes_of = keep.bytes_of
     if bytes_of is None:
         raise BudgetError(
             f"keep is {keep}, which is found by writing; expected a ratio, a count or the size of a .ply here"
         )
     # The size never falls with the count, but grows unevenly: headers hold its digits, and chunks are padded.
-    count = bisect.bisect_right(range(1, n + 1), limit, key=lambda count: bytes_of(count, sh_degree, traits))
+    count = bisect.bisect_right(range(1, n + 1), keep.bytes, key=lambda count: bytes_of(count, sh_degree, traits))
     if count < 1:
         least = bytes_of(1, sh_degree, traits)
         raise BudgetError(
@@ -153,7 +153,7 @@ def parse_keep(text: str, suffix: str = ".ply") -> Keep:
     the dense scene. A size or a PSNR without a format is for files with ``suffix``.
 
     Raises:
-        BudgetError: if it is none of these. The range of a ratio, count or size is checked by :func:`resolve_keep`.
+        BudgetError: if it is none of these. The range of a ratio or count is checked by :func:`resolve_keep`.
 
     Example:
         >>> parse_keep("30%"), parse_keep("50000"), parse_keep("1"), parse_keep("1.0"), parse_keep("12MB")
@@ -163,10 +163,7 @@ def parse_keep(text: str, suffix: str = ".ply") -> Keep:
     try:
         if auto := re.fullmatch(r"auto(?::(.+?)(?:dB)?)?(\.[a-z]\S*)?", text):
             # An independent error of 35 dB lowers a PSNR of 30 dB against photos by 1.2 dB, and one of 25 dB by 0.4 dB.
-            psnr = 35.0 if auto[1] is None else float(auto[1])
-            if not 0 < psnr < math.inf:
-                raise ValueError
-            return WithinPsnr(psnr, auto[2] or suffix)
+            return WithinPsnr(35.0 if auto[1] is None else float(auto[1]), auto[2] or suffix)
         if size := re.fullmatch(r"(.*\d *[kmg]?b)(\.\S+)?", text, re.IGNORECASE):
             return Megabytes(parse_megabytes(size[1]), (size[2] or suffix).lower())
         if text.endswith("%"):

@@ -14,18 +14,17 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
-from pointsplat_ns.pruning.budget import Keep, resolve_keep
-from pointsplat_ns.pruning.coverage import coverage_score
-from pointsplat_ns.pruning.scores import (
+from pointsplat_ns.pruning.baselines import (
     area_score,
     authors_score,
     log_volume_score,
     opacity_score,
-    paper_score,
     random_score,
     volume_score,
 )
-from pointsplat_ns.pruning.select import select
+from pointsplat_ns.pruning.budget import Keep, resolve_keep
+from pointsplat_ns.pruning.coverage import coverage_score
+from pointsplat_ns.pruning.paper import paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.views import Views
 
@@ -64,14 +63,16 @@ METHODS: dict[str, Method] = {
 """All methods by name, the best first."""
 
 
-def method_named(by: str) -> Method:
-    """The method called ``by``.
-
-    Raises:
-        PointSplatError: if there is no such method.
-    """
+def method_named(by: str, opacity_weight: float | None = None) -> Method:
+    """The method called ``by``. Raises PointSplatError if there is none, or it has no opacity weight but is given
+    one."""
     if by not in METHODS:
         raise PointSplatError(f"no method is called {by!r}; expected one of {', '.join(METHODS)}")
+    if opacity_weight is not None and not METHODS[by].weighs_opacity:
+        weighing = ", ".join(other.name for other in METHODS.values() if other.weighs_opacity)
+        raise PointSplatError(
+            f"opacity weight {opacity_weight:g}: {by} does not weigh opacity; leave it out, or choose one of {weighing}"
+        )
     return METHODS[by]
 
 
@@ -99,10 +100,8 @@ class PruneSettings:
             )
         if keep > 1:  # configuration files write counts as floats
             object.__setattr__(self, "keep", int(keep))
-        method = method_named(self.by)
-        if method.needs_views:
+        if method_named(self.by, self.opacity_weight).needs_views:
             raise PointSplatError(f"{self.by} looks at a scene from poses; expected a method that needs none")
-        check_opacity_weight(method, self.opacity_weight)
 
     def prune(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Gaussians:
         """Prune a scene with these settings; see :func:`prune`."""
@@ -137,8 +136,7 @@ def prune(
         DataError: if the method needs views and there are none.
         PointSplatError: if there is no such method, or it has no opacity weight but is given one.
     """
-    method = method_named(by)
-    check_opacity_weight(method, opacity_weight)
+    method = method_named(by, opacity_weight)
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
     need_usable(scene)
     if method.score is None:
@@ -168,25 +166,9 @@ def score_of(
     return method.score(scene)
 
 
-def check_opacity_weight(method: Method, opacity_weight: float | None) -> None:
-    """Refuse an opacity weight that a method does not use.
-
-    Raises:
-        PointSplatError: if a weight is given and the method has none.
-    """
-    if opacity_weight is not None and not method.weighs_opacity:
-        weighing = ", ".join(other.name for other in METHODS.values() if other.weighs_opacity)
-        raise PointSplatError(
-            f"opacity weight {opacity_weight:g}: {method.name} does not weigh opacity; leave it out, or choose one of "
-            f"{weighing}"
-        )
-
-
 def need_usable(scene: Gaussians) -> None:
-    """Refuse a scene of which no Gaussian can be drawn.
-
-    Raises:
-        SceneError: if all have NaN or infinite values.
-    """
+    """Raise a SceneError if no Gaussian of a scene can be drawn."""
+    if len(scene) == 0:
+        raise SceneError("the scene holds no Gaussians that can be drawn")
     if not bool(scene.usable().any()):
         raise SceneError(f"none of the {len(scene)} Gaussians can be drawn: all have NaN or infinite values")

@@ -15,7 +15,7 @@ import torch
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.pruning.scores import area_score
+from pointsplat_ns.pruning.baselines import area_score
 
 
 def band_energies(scene: Gaussians) -> list[float]:

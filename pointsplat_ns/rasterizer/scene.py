@@ -43,6 +43,7 @@ def render(
         Colours in [0, 1]: (H, W, 3) for a view, (C, H, W, 3) for C views.
 
     Raises:
+        TypeError: if ``views`` is neither.
         ValueError: if a camera is not finite or has no focal length, or there is no such quality.
 
     Warns:
@@ -59,6 +60,8 @@ def render(
         if len(views) == 0:
             return scene.means.new_zeros(0, views.height, views.width, 3)
         return torch.stack([render(scene, view, quality, backend) for view in views])
+    if not isinstance(views, View):
+        raise TypeError(f"views is {views!r}; expected a View or Views, such as sample_views(scene, 3)")
     return render_with_alpha(scene, views, quality, backend)[0]
 
 

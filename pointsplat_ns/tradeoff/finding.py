@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from pointsplat_ns.compression.compact import Compacted, as_compacted
+from pointsplat_ns.compression.compact import as_compacted
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import cut_sh
@@ -66,8 +67,8 @@ def find_scene(
     compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
     seconds, why = time.perf_counter() - start, found.why
-    if measurer.judged_views.photos is not None and compacted.closeness is not None and len(compacted.stages) > 1:
-        why += f"; a repair is accepted in {compacted.closeness.where} of the photos that were trained on"
+    if measurer.judged_views.photos is not None and compacted.last.after is not None and len(compacted.stages) > 1:
+        why += f"; a repair is accepted in {compacted.last.after.where} of the photos that were trained on"
     return replace(compacted, target=why, interrupted=interrupted, notes=notes, seconds=seconds)
 
 

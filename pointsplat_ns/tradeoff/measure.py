@@ -17,12 +17,12 @@ from pointsplat_ns.io.scene import save
 from pointsplat_ns.io.source import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import (
     dataset_photos,
-    dataset_views,
     need_named_data,
     training_photos,
+    view_source,
 )
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
@@ -184,7 +184,6 @@ def subject_of(
         resolution, up: as for :class:`~pointsplat_ns.looking.view_source.ViewSource`.
         data: where the data of the run is now, if it moved.
     """
-    read = functools.partial(dataset_views, data=data)
     held_out = None
     if run is not None and views is None and may_be_run(run):
         held_out = functools.partial(dataset_photos, run, "test", data=data)
@@ -192,7 +191,7 @@ def subject_of(
         dense=dense,
         path=run or Path("scene.ply"),
         name="scene",
-        new_views=lambda: ViewSource(dense, views, run, read, resolution, up=up),
+        new_views=lambda: view_source(dense, views, run, data, resolution, up),
         held_out=held_out,
         refiner=refiner,
         suffix=suffix,

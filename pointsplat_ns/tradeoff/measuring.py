@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
-from pointsplat_ns.compression.compact import Compacted, compact_scene, rounding_stage
+from pointsplat_ns.compression.compact import compact_scene, rounding_stage
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget

@@ -138,7 +138,6 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     assert "expected a trained pointsplat run" in refusal(capsys, output, ply, "--refiner", ply)
     torn = tmp_path / "torn.safetensors"
     torn.write_bytes(helps.read_bytes()[:1000])
-    write_ply(room()[:0], tmp_path / "empty.ply")
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"
     for scene, options, wanted in (
@@ -148,7 +147,6 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
         (ply, ("--refiner", tmp_path / "flat.safetensors"), "SH degree 1; the refiner"),
         (tmp_path / "gone.ply", ("--refiner", helps), "gone.ply: no such file"),
         (tmp_path / "gone.ply", ("--seconds", "-1"), "the time to repair is -1 s; expected 0 or more"),
-        (tmp_path / "empty.ply", (), "Gaussians"),
         (ply, ("--keep", "half"), "keep is 'half'"),
         (ply, ("--by", "best"), f"expected one of {', '.join(METHODS)}"),
         (ply, ("--picture", shown.with_suffix(".jpg")), "ends in .png"),

@@ -10,7 +10,8 @@ import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
 from pointsplat_ns.compression import acceptance
 from pointsplat_ns.compression.acceptance import closer_in, interpolate, parabola_minimum
-from pointsplat_ns.compression.compact import Compacted, compact_scene
+from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
@@ -247,7 +248,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
 
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
-    assert same(result.scene, pruned) and result.after_repair.psnr > result.before.psnr + 3
+    assert same(result.scene, pruned) and result.repaired.after.psnr > result.before.psnr + 3
     assert closer_in(result.before, result.after) == 1
     assert result.verdict.startswith("not refined by the network, it is farther in most views: ")
     assert "not repaired by 5 steps in 0.5 s, it is farther in most views: " in result.verdict

@@ -78,14 +78,6 @@ def test_factors_reach_their_parameters_and_what_no_view_shows_stays(scene):
         assert not learned[name][3].any()
 
 
-def seen(scene: Gaussians, size: float = 1.0) -> torch.Tensor:
-    """Features after two steps."""
-    feedback = Feedback(scene, 1000)
-    for seed in (0, 1):
-        feedback.observe(gradients(scene, seed, size))
-    return feedback.features(scene, 0.25, 8)
-
-
 @pytest.mark.parametrize(("steps", "shown"), [(20, 20), (1, 6), (500, 32)])
 @pytest.mark.parametrize("degree", [0, 2])
 def test_features_are_what_the_network_was_trained_on(scene, steps, shown, degree):

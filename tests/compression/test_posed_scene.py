@@ -245,13 +245,13 @@ def test_a_transform_that_is_no_similarity_is_refused(tmp_path):
         run_frame(run)
 
 
-@pytest.mark.parametrize("up", ["w", "", "z:", "z:y:x", "north"])
-def test_an_axis_that_is_none_is_refused(up):
-    with pytest.raises(PointSplatError, match="expected an axis such as z"):
-        ps.place(cloud(3), up=up)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
-def test_a_scale_that_means_nothing_is_refused(scale):
-    with pytest.raises(PointSplatError, match="expected a number above 0"):
-        ps.place(cloud(3), scale=scale)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({"up": up}, "expected an axis such as z") for up in ("w", "", "z:", "z:y:x", "north")),
+        *(({"scale": scale}, "expected a number above 0") for scale in (0.0, -1.0, math.nan, math.inf)),
+    ],
+)
+def test_an_axis_or_a_scale_that_is_none_is_refused(options, message):
+    with pytest.raises(PointSplatError, match=message):
+        ps.place(cloud(3), **options)

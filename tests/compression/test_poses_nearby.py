@@ -10,7 +10,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, run_of
-from pointsplat_ns.compacting import read_source
+from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.pictures import write_picture
 from posing import inria, name_of, nerfstudio, write_colmap_text
@@ -33,7 +33,7 @@ def said(caplog) -> pytest.LogCaptureFixture:
 
 
 def known(path: Path, poses: str | None = None) -> ps.Views | None:
-    return read_source(path, poses, None)[1].given
+    return read_source(path, Looking(poses))[1].given
 
 
 def same(found: ps.Views | None, views: ps.Views) -> bool:
@@ -101,8 +101,8 @@ def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):
 
 def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
     run = run_of(trained_walls, "wall-a")
-    assert read_source(run, None, None)[1].known(3) is not None
-    assert read_source(run, "none", None)[1].known(3) is None
+    assert read_source(run, Looking())[1].known(3) is not None
+    assert read_source(run, Looking("none"))[1].known(3) is None
 
 
 def test_commands_of_a_sweep_of_sampled_views_say_so(trained_walls, tmp_path):

@@ -91,7 +91,7 @@ def test_what_is_no_scene_is_refused(scene):
         ({"by": "best"}, f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
         ({"sh": "4"}, "sh is '4'; expected all, auto or a degree from 0 to 3"),
         ({"keep": "half"}, "keep is 'half'"),
-        ({"keep": WithinPsnr(-1.0)}, "the wanted PSNR is -1.0 dB"),
+        ({"keep": "auto:-1"}, "the wanted PSNR is -1.0 dB"),
         ({"by": "merge", "opacity_weight": 0.5}, "opacity weight 0.5: merge does not weigh opacity"),
     ],
 )

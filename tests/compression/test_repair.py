@@ -7,15 +7,17 @@ import pytest
 import torch
 
 import pointsplat_ns.compression.repair as repair_module
-from making import FewViews, same
+from making import FewViews, ball, same
 from pointsplat_ns.api import example_room
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms, optimised
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.metrics import SSIM_WINDOW
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from quick_looking import USUAL
@@ -169,3 +171,22 @@ def test_the_size_of_gradients_is_right_at_the_extremes(size, dtype):
     gradient[:3] = torch.tensor([1.0, -2.0, 2.0], dtype=dtype)[:, None] * size
     assert nonzero_rms(gradient) == pytest.approx(size * 3**0.5, rel=1e-6)
     assert nonzero_rms(gradient[:0]) == 0
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 12), (16, SSIM_WINDOW), (16, SSIM_WINDOW - 1)])
+def test_the_loss_is_that_of_3dgs_and_without_ssim_where_no_window_fits(width, height):
+    scene = ball(40)
+    view = sample_views(scene, 1, width, height)[0]
+    target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+    leaves = scene.map(lambda value: value.clone().requires_grad_())
+    image = render(leaves, view)
+    loss = (image - target).abs().mean()
+    if height >= SSIM_WINDOW:
+        similarity = mean_ssim(image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])
+        loss = 0.8 * loss + 0.2 * (1 - similarity)
+    loss.backward()
+    found = gradients_of(scene, view, target)
+    assert float(found["features_dc"].abs().max()) > 0
+    for name, value in leaves.items():
+        torch.testing.assert_close(found[name], value.grad, msg=name)
+    assert not any(value.requires_grad for value in scene.tensors())

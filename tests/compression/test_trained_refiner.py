@@ -8,30 +8,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, same
+from making import ball, normal_scene, same
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.trained_refiner import load_refiner, open_refiner_run, scenes_of_run
 from pointsplat_ns.errors import BudgetError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, save_refiner
 from pointsplat_ns.refiner.weights import SHIPPED_REFINER
-
-
-def random_scene(n: int = 60, degree: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(7)
-
-    def normal(*shape):
-        return torch.randn(shape, generator=generator)
-
-    return Gaussians(
-        means=normal(n, 3),
-        scales=normal(n, 3) - 3,
-        quats=normal(n, 4),
-        opacities=normal(n, 1),
-        features_dc=normal(n, 3),
-        features_rest=0.1 * normal(n, (degree + 1) ** 2 - 1, 3),
-    )
 
 
 def network(head: str = "scales", moved: float = 0.2) -> Refiner:
@@ -124,7 +107,7 @@ def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(make_refined_run, trained_walls, tmp_path, degree):
     loaded = load_refiner(make_refined_run(tmp_path, trained_walls, moved=0.25, keep=0.4, by="opacity"))
-    dense = random_scene(degree=degree)
+    dense = normal_scene(60, degree, seed=7)
     small = loaded(loaded.settings.prune(dense))
     pruned = prune(dense, 0.4, "opacity")
     assert len(small) == 24 and small.sh_degree == degree

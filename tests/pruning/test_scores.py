@@ -13,30 +13,43 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
 from pointsplat_ns.pruning.coverage import mass_shares
-from pointsplat_ns.pruning.scores import paper_score
 
 SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
 
 
-def equation_3(scene, weight):
-    """The formula as printed, in numpy's extended precision."""
-    scales, logits = (x.double().numpy().astype(np.longdouble) for x in (scene.scales, scene.opacities[:, 0]))
-    alpha = 1 / (1 + np.exp(-logits))
-    volume = (
-        np.longdouble(4 / 3) * np.longdouble(np.pi) * np.exp(scales[:, 0]) * np.exp(scales[:, 1]) * np.exp(scales[:, 2])
-    )
-    z = [(x - x.mean()) / x.std() for x in (alpha, volume)]
-    return torch.from_numpy((weight * z[0] + (1 - weight) * z[1]).astype(np.float64))
+def z(x):
+    return (x - x.mean()) / x.std()
 
 
+def exactly(scene):
+    """Opacities (N,), standard deviations (N, 3), logits and log-scales in numpy's extended precision."""
+    logits, scales = (x.double().numpy().astype(np.longdouble) for x in (scene.opacities[:, 0], scene.scales))
+    return 1 / (1 + np.exp(-logits)), np.exp(scales), logits, scales
+
+
+FORMULAS = {
+    "paper": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
+    "authors": lambda w, alpha, s, logit, log_s: w * z(logit) + (1 - w) * z((log_s + np.longdouble(1e-6)).prod(1)),
+    "log-volume": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.log(s.prod(1))),
+    "opacity": lambda w, alpha, s, logit, *_: logit,
+    "volume": lambda w, alpha, s, *_: np.log(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
+    "area": lambda w, alpha, s, *_: np.log(alpha * np.sort(s, 1)[:, 1:].prod(1)),
+}
+"""Scores as printed, from a weight of opacity and what :func:`exactly` gives."""
+
+
+@pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("weight", [None, 0.0, 0.3, 1.0])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_paper_score_is_equation_3_with_the_papers_weight_by_default(weight, dtype):
+def test_a_score_is_its_formula_with_the_papers_weight_by_default(name, weight, dtype):
     scene = normal_scene(50, 1, dtype=dtype)
     scene = scene.replace(scales=3 * scene.scales - 4)
-    found = paper_score(scene) if weight is None else paper_score(scene, weight)
+    options = {} if weight is None or not METHODS[name].weighs_opacity else {"opacity_weight": weight}
+    wanted = FORMULAS[name](0.3 if weight is None else weight, *exactly(scene))
     # 1e-12: both are computed in at least float64, over 50 terms
-    assert torch.allclose(found, equation_3(scene, 0.3 if weight is None else weight), rtol=1e-12, atol=1e-12)
+    assert torch.allclose(
+        SCORES[name](scene, **options), torch.from_numpy(wanted.astype(np.float64)), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_authors_rank_a_pancake_above_a_ball_and_the_paper_below():
@@ -69,36 +82,6 @@ def test_random_is_the_same_for_one_seed_and_another_for_the_next():
     scene = normal_scene(50, 1)
     assert torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=3))
     assert not torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=4))
-
-
-def z(x):
-    apart = x - x.mean()
-    return apart / (apart**2).mean() ** 0.5
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
-def test_authors_is_the_formula_of_the_released_code(weight):
-    scene = normal_scene(50, 1)
-    logits, scales = (x.double().numpy().astype(np.longdouble) for x in (scene.opacities[:, 0], scene.scales))
-    product = np.longdouble(4 / 3 * math.pi) * np.prod(scales + np.longdouble(1e-6), axis=1)
-    wanted = torch.from_numpy((weight * z(logits) + (1 - weight) * z(product)).astype(np.float64))
-    # 1e-12: float64 over 50 terms
-    assert torch.allclose(SCORES["authors"](scene, opacity_weight=weight), wanted, rtol=1e-12, atol=1e-12)
-
-
-FORMULAS = {
-    "opacity": lambda scene: torch.logit(scene.alphas),
-    "volume": lambda scene: (4 / 3 * math.pi * scene.stds.prod(dim=1)).log(),
-    "log-volume": lambda scene: 0.3 * z(scene.alphas) + 0.7 * z(scene.stds.prod(dim=1).log()),
-    "area": lambda scene: (scene.alphas * scene.stds.sort(dim=1).values[:, 1:].prod(dim=1)).log(),
-}
-
-
-@pytest.mark.parametrize("name", FORMULAS)
-def test_other_scores_are_their_formulas(name):
-    scene = normal_scene(50, 1, dtype=torch.float64)
-    # 1e-12: float64, over up to 50 terms
-    assert torch.allclose(SCORES[name](scene), FORMULAS[name](scene), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", sorted(SCORES))
