@@ -167,7 +167,7 @@ def compact(
     clean: bool = False,
     effort: Effort = "quick",
     seconds: float | None = None,
-    photos: bool = False,
+    photos: bool | str | Path = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -225,10 +225,11 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos)
+    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos))
     format_to_write(target_format)
     goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
-    _, result, _ = compact_source(scene, request, goal, Looking(views, resolution, up, data), progress)
+    looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
+    _, result, _ = compact_source(scene, request, goal, looking, progress)
     return result
 
 

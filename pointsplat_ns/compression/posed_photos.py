@@ -16,8 +16,9 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 
+from pointsplat_ns.compression.compacted import Compacted, last_kept
 from pointsplat_ns.compression.optimiser import Example
-from pointsplat_ns.compression.photo_repair import Photos
+from pointsplat_ns.compression.photo_repair import Photos, mean_psnr
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_named_views, transforms_beside
@@ -100,6 +101,18 @@ def read_posed_photos(
         len(examples), folder, model, len(held), bytes_text(sum(_bytes_of(examples[i]) for i in examples)),
     )  # fmt: skip
     return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held], model)
+
+
+def held_out_text(dense: Gaussians, result: Compacted, photos: Photos) -> str:
+    """Text on what training on photos did in held-out ones, at most twelve of them; ``dense`` is on the device that
+    renders."""
+    shown = spread_indices(len(photos), 12)
+    at = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), len(result.stages))
+    scenes = (last_kept(result.stages[:at]).scene, result.scene, dense)
+    before, after, best = (mean_psnr(scene.to(dense.device), photos, shown) for scene in scenes)
+    return (
+        f"held-out photos: {before:.1f} -> {after:.1f} dB PSNR in {len(shown)} photos, of the dense scene {best:.1f} dB"
+    )
 
 
 def _posed_files(
