@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,15 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, views_from_within
+from pointsplat_ns.cli import main
 from pointsplat_ns.compression.posed_photos import read_posed_photos
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.compression.requests import PHOTO_STEPS
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
 from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking import photo_frame as module
+from pointsplat_ns.looking.poses import look_at, views_of
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text
 
 COUNT = 18
@@ -104,8 +109,6 @@ def test_frames_that_a_similarity_mends_are_found_and_named(turn, scale, flipped
 
 def test_a_scene_in_the_frame_of_nerfstudio_needs_no_file_that_says_so(scene, views, tmp_path, said):
     """The scene is turned, moved and scaled as nerfstudio does; the file of its dataset is not at hand."""
-    from pointsplat_ns.io.turning import Similarity
-
     poses = invert_rigid(views.viewmats.double())
     oriented = module._as_nerfstudio(poses)
     matrix = oriented[0, :3, :3] @ poses[0, :3, :3].T
@@ -182,3 +185,81 @@ def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, mo
         read_posed_photos(scene, folder)
     small = read_posed_photos(scene, folder, resolution=(32, 24))
     assert small.training[0].target.shape == (24, 32, 3) and (small.views.width, small.views.height) == (32, 24)
+
+
+def test_a_scene_that_gsplat_normalised_is_found_by_the_points_of_the_model(scene, views, tmp_path, said):
+    """Axes of the points of any signs: turns of axes find the rest."""
+    folder = write_photos(scene, views, tmp_path / "images")
+    model = write_colmap_text(views, tmp_path / "sparse/0")
+    points = (scene.means.double() * torch.tensor([1.0, 0.7, 0.4])) @ torch.linalg.qr(torch.randn(3, 3).double()).Q
+    rows = [f"{number} {x} {y} {z} 0 0 0 0.5 1 0" for number, (x, y, z) in enumerate(points.tolist())]
+    (model / "points3D.txt").write_text("# 3D point list\n" + "\n".join(rows) + "\n")
+    poses = invert_rigid(views.viewmats.double())
+    there = module._as_gsplat(poses, points)
+    matrix = there[0, :3, :3] @ poses[0, :3, :3].T
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    scale = float((there[0, :3, 3] - there[1, :3, 3]).norm() / (poses[0, :3, 3] - poses[1, :3, 3]).norm())
+    offset = there[0, :3, 3] - scale * matrix @ poses[0, :3, 3]
+    found = read_posed_photos(Similarity(half_turn @ matrix, scale, half_turn @ offset).apply(scene), folder)
+    turned = module._turned(there, half_turn)
+    assert same_poses(found.views, replace(views, viewmats=invert_rigid(turned)), 1e-4)
+    assert "normalised as gsplat does, axes x, y, z of the scene are -x, -y, z of the poses" in said.text
+
+
+def test_a_white_background_is_found(views, tmp_path, said):
+    """Of an object: black is behind it in renders, unless they are told."""
+    thing = ball(400)
+    thing = thing.replace(means=0.3 * thing.means, scales=thing.scales - 1)
+    around = sample_around(views)
+    white = replace(around, background=torch.ones(3))
+    folder = write_photos(thing, white, tmp_path / "images")
+    write_colmap_text(around, tmp_path / "sparse/0")
+    found = read_posed_photos(thing, folder)
+    assert found.views.background.tolist() == found.training[0].view.background.tolist() == [1.0] * 3
+    assert "white background" in said.text
+
+
+def sample_around(views: ps.Views) -> ps.Views:
+    """Cameras two units from the origin that look at it, in a ring."""
+    turns = 6.28 * torch.arange(COUNT) / COUNT
+    eyes = 2 * torch.stack([turns.cos(), turns.sin(), 0.3 * torch.ones(COUNT)], dim=1).double()
+    return replace(views, viewmats=views_of(look_at(eyes, torch.zeros_like(eyes)), 64, 48, 5.0).viewmats.double())
+
+
+@pytest.mark.parametrize("how", ["python", "command"])
+def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, monkeypatch, said, capsys):
+    """What only photos know: other colours than those of the scene."""
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
+    folder = write_photos(scene.replace(features_dc=scene.features_dc + 0.3), views, tmp_path / "my photos")
+    model = write_colmap_binary(views, tmp_path / "model")
+    ps.save(scene, tmp_path / "room.ply")
+    if how == "python":
+        result = ps.compact(scene, "50%", photos=str(folder), views=model)
+        assert result.stages[-1].name == "photos" and result.stages[-1].photos.used == 13
+        before, after, dense = map(float, re.search(TEXT, said.text).groups())
+        assert after > before + 1 and after > dense + 1
+        assert result.views.viewmats.shape[0] == 12 and "given views" in said.text
+    else:
+        words = ["--photos", str(folder), "--poses", str(model), "--keep", "50%"]
+        main(["compact", str(tmp_path / "room.ply"), *words, "-o", str(tmp_path / "small.ply")])
+        out = capsys.readouterr().out
+        assert re.search(TEXT, out) and "trained on 13 photos by 40 steps" in out
+        assert len(ps.load(tmp_path / "small.ply")) == 250
+
+
+TEXT = r"held-out photos: ([\d.]+) -> ([\d.]+) dB PSNR in 3 photos, of the dense scene ([\d.]+) dB"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"views": "none"}, "photos need the file with their poses"),
+        ({"data": "data"}, "the data of a run, but photos are read from"),
+        ({"target_db": 30}, "expected targets or photos"),
+        ({"views": "run.json"}, "no such file"),
+    ],
+)
+def test_options_that_do_not_go_with_a_folder_of_photos_are_refused(options, text, scene, views, tmp_path):
+    folder = write_photos(scene, views[:1], tmp_path)
+    with pytest.raises(PointSplatError, match=text):
+        ps.compact(scene, None if "target_db" in options else "50%", photos=folder, **options)
