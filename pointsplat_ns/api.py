@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from pointsplat_ns.compacting import Looking, Source, compact_source, goal_of, log, prune_source, read_source
+from pointsplat_ns.compacting import Looking, Source, compact_source, log, prune_source, read_source
 from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.pictures import plot_views as draw_views
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
@@ -37,6 +37,7 @@ from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
+from pointsplat_ns.tradeoff.targets import targets_of
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
@@ -192,8 +193,7 @@ def compact(
         keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the budget
             of the refiner's training, or a tenth without a refiner.
         refiner: from :func:`load_refiner`; by default none.
-        by: the method, as for :func:`prune`; by default the method of the refiner's training, or "merge" without a
-            refiner.
+        by: the method, as for :func:`prune`; by default that of the refiner's training, or "merge".
         sh, clean: as for :func:`prune`.
         effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
@@ -225,11 +225,12 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos))
+    on_photos = photos is not False
     format_to_write(target_format)
-    goal = goal_of(request, keep, target_db, target_ms, target_mb, target_format)
+    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
     looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
-    _, result, _ = compact_source(scene, request, goal, looking, progress)
+    _, result, _ = compact_source(scene, request, targets, looking, progress)
     return result
 
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.posed_photos import PosedPhotos
     from pointsplat_ns.compression.quality import FullSizeQuality
-    from pointsplat_ns.compression.requests import Effort
     from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.targets import Targets
 
@@ -63,17 +62,6 @@ class Looking:
         return Path(named) if isinstance(named, (str, Path)) and not without_poses(named) else None
 
 
-@dataclass(frozen=True)
-class Goal:
-    """The goal of a search for the cheapest scene."""
-
-    targets: Targets
-    effort: Effort
-    """Effort of repairs."""
-    suffix: str
-    """Suffix of the format whose size counts."""
-
-
 @normal_mode
 def prune_source(
     scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False, compared: bool = False
@@ -101,13 +89,13 @@ def prune_source(
 def compact_source(
     scene: Source,
     request: CompactRequest,
-    goal: Goal | None,
+    targets: Targets | None,
     looking: Looking,
     progress: bool | Progress = False,
     compared: bool = False,
 ) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
-    """Read a scene and compact it, or search for a goal; verdicts and notes are logged. A search uses only the method
-    and the refiner of the request, and decides the rest.
+    """Read a scene and compact it, or search for targets; verdicts and notes are logged. A search uses only method,
+    refiner, effort and format of the request, and decides the rest.
 
     Returns:
         The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
@@ -116,12 +104,12 @@ def compact_source(
     from pointsplat_ns.compression.quality import quality_if_seen
 
     posed = None
-    if goal is None and looking.photos is not None:
+    if looking.photos is not None:
         dense, source, posed = _read_with_photos(scene, looking, looking.photos, progress)
     else:
         dense, source = read_source(scene, looking)
     with progress_bar(progress) as report:
-        if goal is None:
+        if targets is None:
             from pointsplat_ns.compression.compact import compact_scene
 
             photos = None if posed is None else posed.training
@@ -133,9 +121,9 @@ def compact_source(
             from pointsplat_ns.tradeoff.measure import subject_of
             from pointsplat_ns.tradeoff.settings import repairs_of
 
-            run, size, data = looking.run_of(scene), looking.size, looking.data
-            subject = subject_of(dense, run, source.given, request.refiner, goal.suffix, size, looking.upward, data)
-            result = find_scene(subject, goal.targets, request.prune.by, repairs_of(goal.effort), report)
+            run, size, upward, data = looking.run_of(scene), looking.size, looking.upward, looking.data
+            subject = subject_of(dense, run, source.given, request.refiner, request.prune.suffix, size, upward, data)
+            result = find_scene(subject, targets, request.prune.by, repairs_of(request.repair.effort), report)
         quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
     if posed is not None and posed.held_out:
@@ -143,19 +131,6 @@ def compact_source(
 
         log((held_out_text(dense.to(request.device), result, posed.held_out),))
     return dense, result, quality
-
-
-def goal_of(
-    request: CompactRequest, keep: object, db: float | None, ms: float | None, mb: float | None, suffix: str
-) -> Goal | None:
-    """The goal of a search, from a PSNR against the dense scene's renders in dB, the time of a frame in milliseconds
-    and the size of a file of a format in units of 10^6 bytes; None if no target is given. Raises BudgetError if a
-    target is not positive, or an option was given that a search decides, such as ``keep``."""
-    from pointsplat_ns.tradeoff.targets import targets_of
-
-    pruning, photos = request.prune, request.photos is not None
-    targets = targets_of(db, ms, mb, keep, pruning.sh, pruning.clean, request.repair.seconds, photos)
-    return None if targets is None else Goal(targets, request.repair.effort, suffix)
 
 
 def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]:

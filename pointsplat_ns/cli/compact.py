@@ -162,10 +162,11 @@ def compact(
             shard=shard, force=force,
         )  # fmt: skip
     need_no_folder_options(scene, jobs, shard)
-    from pointsplat_ns.compacting import Looking, compact_source, goal_of
+    from pointsplat_ns.compacting import Looking, compact_source
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
+    from pointsplat_ns.tradeoff.targets import targets_of
 
     check_poses(poses)
     output = output or output_beside(scene, "compact")
@@ -176,10 +177,10 @@ def compact(
     request = CompactRequest.of(
         _loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
     )
-    goal = goal_of(request, keep, target_db, target_ms, target_mb, kind.budget_suffix)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
     looking = Looking(poses, resolution, up, data, photos if isinstance(photos, Path) else None)
     with fixed_threads(threads):
-        dense, result, quality = compact_source(scene, request, goal, looking, progress=True, compared=True)
+        dense, result, quality = compact_source(scene, request, targets, looking, progress=True, compared=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True)
     with scene_written(written):

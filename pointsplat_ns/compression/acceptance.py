@@ -32,12 +32,6 @@ class AcceptanceSettings:
     """Least gain of PSNR, in dB: the sign of a smaller gain depends on the views."""
     most_loss: float = 0.05
     """Largest loss of PSNR, in dB, in pictures of another size."""
-    nearer: int = 4
-    """Factor on the full size of pictures for one more check, which stands for nearer cameras."""
-    clear_gain: float = 0.5
-    """Gain of PSNR, in dB, of the whole change that makes trying smaller shares unnecessary."""
-    apart: float = 0.05
-    """Least distance of the parabola's minimum from 0, 1/2 and 1 for a try: closer shares hardly differ."""
 
 
 ACCEPTANCE = AcceptanceSettings()
@@ -77,7 +71,7 @@ class Comparison:
         self.device = dense.device
         whole = views.whole()
         sides = sides_of(whole.width, whole.height)
-        others = (sides[0], sides[-1], ACCEPTANCE.nearer * sides[-1])
+        others = (sides[0], sides[-1], 4 * sides[-1])
         self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
 
     def psnrs(self, scene: Gaussians) -> list[float]:
@@ -128,19 +122,20 @@ def accept_change(
         tried[strength] = judge.reference.closeness(
             scene, lambda share: progress("comparing renders", (done + share) / 3)
         )
-        if not improves(before, tried[strength]):
+        if _why_no_gain(before, tried[strength]) is not None:
             return False
         return all(psnr >= bound for bound, psnr in zip(least(), judge.psnrs(scene), strict=True))
 
     accepted = [1.0] if attempt(1.0) else []
-    if tried[1.0].errors != before.errors and (not accepted or tried[1.0].psnr < before.psnr + ACCEPTANCE.clear_gain):
+    clear_gain = bool(accepted) and tried[1.0].psnr >= before.psnr + 0.5  # dB
+    if tried[1.0].errors != before.errors and not clear_gain:
         accepted += [0.5] if attempt(0.5) else []
         bottom = parabola_minimum(before.error, tried[0.5].error, tried[1.0].error)
-        if all(abs(bottom - share) > ACCEPTANCE.apart for share in (0.0, 0.5, 1.0)):
+        if all(abs(bottom - share) > 0.05 for share in (0.0, 0.5, 1.0)):  # closer shares hardly differ
             accepted += [bottom] if attempt(bottom) else []
     progress("comparing renders", 1.0)
     if not accepted:
-        return Change(old, 1.0, tried[1.0], _reason(before, tried[1.0]))
+        return Change(old, 1.0, tried[1.0], _why_no_gain(before, tried[1.0]) or Reason.OTHER_SIZES)
     strength = min(accepted, key=lambda share: tried[share].error)
     return Change(interpolate(start, end, strength).to(old.device), strength, tried[strength], None)
 
@@ -174,25 +169,16 @@ def parabola_minimum(at_zero: float, at_half: float, at_one: float) -> float:
     return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], 0.0)
 
 
-def improves(before: Closeness, after: Closeness) -> bool:
-    """Whether PSNR rises by :attr:`AcceptanceSettings.min_gain` or more, and the error falls in at least half of the
-    views. The second condition refuses a gain of few views at the cost of the others."""
-    return _gains(before, after) and 2 * closer_in(before, after) >= len(before.errors)
+def _why_no_gain(before: Closeness, after: Closeness) -> Reason | None:
+    """Why errors are no improvement; None if PSNR rises by :attr:`AcceptanceSettings.min_gain` or more, and the error
+    falls in at least half of the views. The second condition refuses a gain of few views at the cost of the others."""
+    if after.psnr <= before.psnr:
+        return Reason.NO_GAIN
+    if not after.psnr >= before.psnr + ACCEPTANCE.min_gain:  # NaN too
+        return Reason.SMALL_GAIN
+    return Reason.MOST_VIEWS if 2 * closer_in(before, after) < len(before.errors) else None
 
 
 def closer_in(before: Closeness, after: Closeness) -> int:
     """Number of views with a smaller error after than before."""
     return sum(new < old for new, old in zip(after.errors, before.errors, strict=True))
-
-
-def _gains(before: Closeness, after: Closeness) -> bool:
-    return after.psnr >= before.psnr + ACCEPTANCE.min_gain and math.isfinite(before.psnr)
-
-
-def _reason(before: Closeness, after: Closeness) -> Reason:
-    """Why a change with these errors is left out."""
-    if improves(before, after):
-        return Reason.OTHER_SIZES
-    if _gains(before, after):
-        return Reason.MOST_VIEWS
-    return Reason.NO_GAIN if after.psnr <= before.psnr else Reason.SMALL_GAIN

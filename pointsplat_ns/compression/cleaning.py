@@ -28,23 +28,8 @@ from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
-
-@dataclass(frozen=True)
-class CleaningSettings:
-    """Cameras of cleaning."""
-
-    places: int = 16
-    """Number of places of cameras. More places remove less and take longer."""
-    side: int = 32
-    """Width of each of the six images of a place, pixels. It hardly changes the time. A coarse image shows more small
-    Gaussians, because the rasterizer draws none thinner than a pixel."""
-    seed: int = 17
-    """Seed of the places. Views for comparisons have another seed."""
-    checked_views: int = 4
-    """Maximum number of views for comparisons with the dense scene."""
-
-
-CLEANING = CleaningSettings()
+PLACES = 16
+"""Number of places of cameras. More places remove less and take longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +41,15 @@ class Junk:
     places: int
     """Number of places of cameras; 0 if nothing is visible, and no Gaussian is unseen then."""
 
-    def __len__(self) -> int:
-        return len(self.undrawable) + len(self.unseen)
+    def first(self, count: int) -> Junk:
+        """The first ``count``: undrawable Gaussians, then unseen ones."""
+        undrawable = self.undrawable[:count]
+        return Junk(undrawable, self.unseen[: count - len(undrawable)], self.places)
+
+    @property
+    def indices(self) -> Tensor:
+        """Indices of all, undrawable Gaussians first."""
+        return torch.cat([self.undrawable, self.unseen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +65,7 @@ class Cleaning:
     def apply(self, scene: Gaussians, at_least: int) -> Gaussians:
         """The scene as read, perhaps with fewer SH bands, without its junk. The most opaque junk stays where fewer than
         ``at_least`` Gaussians would remain."""
-        dropped = _first(self.junk, self.count - at_least)
-        return _without(scene, torch.cat([dropped.undrawable, dropped.unseen]))
+        return _without(scene, self.junk.first(self.count - at_least).indices)
 
 
 @torch.no_grad()
@@ -114,49 +105,32 @@ def clean_scene(dense: Gaussians, at_least: int, views: ViewSource, progress: Pr
     """Find the junk of a scene, and measure the PSNR of renders without it. Views do not decide which Gaussians are
     junk. At least ``at_least`` Gaussians, in 1..N, remain."""
     junk = find_junk(dense, progress=progress)
-    dropped = _first(junk, len(dense) - at_least)
-    if len(dropped) == 0:
-        why = f"; {len(junk):,} could go, but the budget keeps all" if len(junk) else ""
+    dropped = junk.first(len(dense) - at_least)
+    if len(dropped.indices) == 0:
+        why = f"; {len(junk.indices):,} could go, but the budget keeps all" if len(junk.indices) else ""
         return Cleaning(junk, len(dense), (f"clean: nothing removed{why}",))
     progress("comparing renders without junk", 0.0)
-    reference = _reference(dense, views)
-    places = f"looking around from {junk.places} places" if junk.places else "nothing to look from was found"
-    rules = (
-        (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
-        (
-            dropped.unseen,
-            torch.cat([dropped.undrawable, dropped.unseen]),
-            f"that are seen from nowhere ({places})",
-        ),
-    )
-    notes = []
-    for gone, so_far, what in rules:
-        notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}")
-        if len(gone) and reference is not None:
-            notes[-1] += f"; renders {_closeness(reference, _without(dense, so_far))}"
-    return Cleaning(junk, len(dense), tuple(notes))
-
-
-def _reference(dense: Gaussians, views: ViewSource) -> DenseReference | None:
-    """Renders of the dense scene; None if there are no views."""
     try:
-        return DenseReference(dense, views.scored(CLEANING.checked_views))
-    except DataError:
-        return None
+        reference = DenseReference(dense, views.scored(4))
+    except DataError:  # no views
+        reference = None
+    places = f"looking around from {junk.places} places" if junk.places else "nothing to look from was found"
+    notes = []
+    for gone, so_far, what in (
+        (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
+        (dropped.unseen, dropped.indices, f"that are seen from nowhere ({places})"),
+    ):
+        close = "" if reference is None or len(gone) == 0 else _closeness(reference, _without(dense, so_far))
+        notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}{close}")
+    return Cleaning(junk, len(dense), tuple(notes))
 
 
 def _closeness(reference: DenseReference, scene: Gaussians) -> str:
     psnr, worst = reference.psnr(scene)
     views = views_text(len(reference.views))
     if math.isinf(psnr):
-        return f"of {views} stay the same"
-    return f"reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
-
-
-def _first(junk: Junk, count: int) -> Junk:
-    """The first ``count`` of the junk: undrawable Gaussians, then unseen ones, by rising opacity."""
-    undrawable = junk.undrawable[:count]
-    return Junk(undrawable, junk.unseen[: count - len(undrawable)], junk.places)
+        return f"; renders of {views} stay the same"
+    return f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
@@ -173,16 +147,19 @@ def _views_all_around(scene: Gaussians) -> Views:
     nothing is visible."""
     # Without SH, so that places do not depend on where photos were taken.
     without_sh = scene.replace(features_rest=scene.features_rest[:, :0])
-    views = Sampler(without_sh).views(CLEANING.places, CLEANING.seed, likeliest=True)  # few are behind walls
+    # few of the likeliest are behind walls; views for comparisons have another seed
+    views = Sampler(without_sh).views(PLACES, seed=17, likeliest=True)
     places = invert_rigid(views.viewmats)[:, :3, 3]
     rotations = _six_directions().to(places)
     viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
-    half = CLEANING.side / 2  # a field of view of 90 degrees
+    # A side hardly changes the time. A coarse image shows more small Gaussians, as none is drawn thinner than a pixel.
+    side = 32  # pixels
+    half = side / 2  # a field of view of 90 degrees
     K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], **FLOATS)
     viewmats = viewmats.flatten(0, 1)
-    return Views(viewmats, K.repeat(len(viewmats), 1, 1), CLEANING.side, CLEANING.side, torch.zeros(3, **FLOATS))
+    return Views(viewmats, K.repeat(len(viewmats), 1, 1), side, side, torch.zeros(3, **FLOATS))
 
 
 def _six_directions() -> Tensor:

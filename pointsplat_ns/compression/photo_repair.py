@@ -56,30 +56,13 @@ class PhotoSettings:
     far."""
     last_factor: float = 0.05
     """Factor on the first rates at the last step. They fall along a half cosine."""
-    unseen_every: int = 8
-    """One photo of this many takes part in no step."""
-    most_unseen: int = 6
-    """Largest number of those photos."""
     dense_every: int = 8
     """One step of this many takes a render of the dense scene. With every fourth, held-out photos lose 0.2 dB and views
     between photos 0.3 dB (vr_project); sampled views, which may be far from photos, gain 1.1 dB."""
-    dense_views: int = 32
-    """Number of the views of these renders."""
     moves: int = 5
     """Number of times that Gaussians are moved (:func:`reallocated`) to where the gradients
     by their means, in units of their size, are largest. At a tenth, held-out photos gain 0.5 dB (fox), 0.2 dB
     (vr_project) and nothing (kitchen, whose photos are blurred)."""
-    moved_share: float = 0.2
-    """Share of the Gaussians that is split each time."""
-    moved_until: float = 0.5
-    """Share of the steps that is done the last time."""
-    checks: int = 8
-    """Number of times that the scene is compared with photos."""
-    step_side: int = 200
-    """Longer side of the pictures of a step, pixels, at least: of larger photos every k-th pixel is taken. In the time
-    of a step on whole photos there are three on these, and held-out photos gain 0.4 dB (fox, vr_project)."""
-    compared_side: int = sides_of(*RESOLUTION)[1]
-    """The same for comparisons."""
 
 
 PHOTO_REPAIR = PhotoSettings()
@@ -132,7 +115,7 @@ def photo_repair(
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
     run, checked = OptimisationRun(budget), 0
-    unseen = list(range(0, len(photos), PHOTO_REPAIR.unseen_every))[: PHOTO_REPAIR.most_unseen]
+    unseen = list(range(0, len(photos), 8))[:6]
     used = sorted({*range(len(photos))} - {*unseen})
     compared = unseen + [used[place] for place in spread_indices(len(used), len(unseen))]
     best, before = scene, mean_psnr(scene, photos, compared)
@@ -140,8 +123,8 @@ def photo_repair(
 
     def compare(scene: Gaussians) -> None:
         nonlocal best, after, checked
-        if int(run.done * PHOTO_REPAIR.checks) > checked:
-            checked = int(run.done * PHOTO_REPAIR.checks)
+        if int(8 * run.done) > checked:  # eight times
+            checked = int(8 * run.done)
             if (psnr := mean_psnr(scene, photos, compared)) > after:
                 best, after = scene, psnr
 
@@ -160,13 +143,14 @@ def _scenes(
         def choose(scene: Gaussians, adam: Adam = adam) -> tuple[float, Tensor]:
             return rate_factor(run.done, PHOTO_REPAIR.last_factor), size_factors(scene, adam.reach)
 
-        until = PHOTO_REPAIR.moved_until * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
+        # the last time when half of the steps are done
+        until = 0.5 * turn / PHOTO_REPAIR.moves if turn <= PHOTO_REPAIR.moves else math.inf
         for stepped in optimised(scene, adam, examples, choose):
             yield (scene := stepped)
             if run.done >= until:
                 break
         pull = adam.root_mean_square("means") * size_factors(scene, adam.reach)[:, 0]
-        scene = reallocated(scene, pull, PHOTO_REPAIR.moved_share, views.for_merging())
+        scene = reallocated(scene, pull, 0.2, views.for_merging())
 
 
 @torch.no_grad()
@@ -174,7 +158,7 @@ def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
     psnrs = []
     for index in indices:
-        view, photo, mask = every_kth_pixel(photos[index], PHOTO_REPAIR.compared_side, scene.device)
+        view, photo, mask = every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device)
         apart, counted = render(scene, view).double() - photo, 1.0
         if mask is not None:
             apart, counted = apart * mask, float(mask.double().mean())
@@ -184,13 +168,15 @@ def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos in random order, each once before any is repeated, and renders of the dense scene; without end."""
-    generator, count = random.Random(0), PHOTO_REPAIR.dense_views
-    places = islice(views.sampled(count=count), count)
+    generator = random.Random(0)
+    places = islice(views.sampled(count=32), 32)
     renders = cycle(Example(view, render(dense, view)) for view in places)  # which keeps them
     order = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):
         if step % PHOTO_REPAIR.dense_every:
-            yield every_kth_pixel(photos[next(order)], PHOTO_REPAIR.step_side, dense.device, generator)
+            # In the time of a step on whole photos there are three on 200 pixels, and held-out photos gain 0.4 dB (fox,
+            # vr_project).
+            yield every_kth_pixel(photos[next(order)], 200, dense.device, generator)
         else:
             with torch.no_grad():
                 example = next(renders)

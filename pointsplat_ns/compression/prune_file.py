@@ -31,10 +31,8 @@ from pointsplat_ns.views import Views
 class MemorySettings:
     """Memory that merging takes, and the sizes of cells that follow from it."""
 
-    whole: int = 400
-    """Bytes for each Gaussian of a scene in memory, beside the scene itself."""
     cell: int = 400
-    """Bytes for each Gaussian of a cell: what follows from the whole scene is known before."""
+    """Bytes for each Gaussian of a cell or of a whole scene in memory, beside its own."""
     base: int = 900_000_000
     """Bytes of the interpreter, torch and a thinned scene."""
     most: int = 4_000_000
@@ -42,8 +40,6 @@ class MemorySettings:
     depend on the memory that happens to be free."""
     least: int = 100_000
     """Smallest number of Gaussians in a cell."""
-    between: int = 150
-    """Bytes on disk for each Gaussian between rounds, beside its row and its share of the result."""
 
 
 MEMORY = MemorySettings()
@@ -72,7 +68,7 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
                 "`pointsplat convert` makes"
             )
         return None
-    size = rows.count * (_row_bytes(rows) + MEMORY.whole)
+    size = rows.count * (_row_bytes(rows) + MEMORY.cell)
     limit = psutil.virtual_memory().available if memory is None else memory - MEMORY.base
     if size <= limit:
         return None
@@ -160,7 +156,7 @@ def prune_file(
         return count
 
     count = count_of(rows.count)  # errors before the work
-    size = rows.count * (_row_bytes(rows) + MEMORY.between) + count * _row_bytes(rows)
+    size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(rows)  # 150 bytes for each between rounds
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
     before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs)

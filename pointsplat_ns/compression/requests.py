@@ -115,7 +115,7 @@ class PruneRequest:
     """Whether to remove Gaussians that no picture needs first (:mod:`~pointsplat_ns.compression.cleaning`). ``keep``
     still refers to the dense scene, and the result has exactly that number of Gaussians."""
     suffix: str = ".ply"
-    """Suffix of the format that a size or a PSNR in the text ``keep`` is for, if it names none."""
+    """Suffix of the format of the result. A size or a PSNR in the text ``keep`` is for it, if it names none."""
     budget: Keep = field(init=False)
     """``keep``, parsed if it is text."""
     method: Method = field(init=False)

@@ -9,7 +9,7 @@ import torch
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import Cleaning, CleaningSettings, clean_scene, find_junk
+from pointsplat_ns.compression.cleaning import PLACES, Cleaning, clean_scene, find_junk
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
@@ -29,7 +29,7 @@ ROOM, THINGS, PLANTED = 5500, 3000, 12
 def few_places() -> Iterator[None]:
     """Four places instead of sixteen, in a quarter of the time, for tests of what does not depend on their number."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cleaning, "CLEANING", CleaningSettings(places=4))
+        patch.setattr(cleaning, "PLACES", 4)
         yield
 
 
@@ -97,7 +97,7 @@ def test_nothing_of_a_clean_room_is_touched():
 
 @pytest.mark.parametrize("kind", JUNK)
 def test_what_is_behind_walls_goes_and_no_view_changes(kind, room, views, monkeypatch):
-    monkeypatch.setattr(cleaning, "CLEANING", CleaningSettings())
+    monkeypatch.setattr(cleaning, "PLACES", PLACES)
     scene = Gaussians.cat([room, JUNK[kind]])
     undrawable, unseen = junk_of(scene)
     assert undrawable == [] and unseen[-PLANTED:] == list(range(ROOM, ROOM + PLANTED))

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, normal_scene, same
-from pointsplat_ns.compression import trained_refiner
+from making import ball, normal_scene
 from pointsplat_ns.compression.trained_refiner import load_refiner, open_refiner_run, scenes_of_run
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.pruning import PruneSettings, prune
@@ -63,13 +62,6 @@ def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_run_is_a_refiner_too(make_refined_run, tmp_path):
-    run = make_refined_run(tmp_path, tmp_path / "nowhere", moved=0.5, keep=0.25, by="opacity")
-    loaded, scene = load_refiner(run), ball(60)
-    assert loaded.settings == PruneSettings(0.25, "opacity") and loaded.source == run
-    assert same(loaded(scene), scene.replace(opacities=scene.opacities + 0.5))
-
-
 def test_anything_else_is_no_refiner(tmp_path):
     (tmp_path / "scene.ply").touch()
     with pytest.raises(WeightsError, match="scene.ply: a .ply file; expected a trained pointsplat run"):
@@ -84,17 +76,6 @@ def test_anything_else_is_no_refiner(tmp_path):
         load_refiner(tmp_path / "pipe")
 
 
-def test_where_the_refiner_that_ships_is_missing_it_is_said_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(trained_refiner, "SHIPPED_REFINER", tmp_path / "refiner.safetensors")
-    with pytest.raises(
-        WeightsError, match="not there; install the package again, or .*--refiner RUN_OR_FILE"
-    ) as caught:
-        load_refiner()
-    assert "\n" not in str(caught.value)
-    save_refiner(Refiner(preset("tiny")), tmp_path / "refiner.safetensors", {"keep": 0.2})
-    assert load_refiner().settings == PruneSettings(0.2, "merge")
-
-
 def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
     folder = importlib.resources.files("pointsplat_ns") / "refiner" / "pretrained"
     assert SHIPPED_REFINER.samefile(str(folder / "refiner.safetensors"))
@@ -107,6 +88,7 @@ def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_scene_of_any_size_and_degree_is_pruned_and_refined(make_refined_run, trained_walls, tmp_path, degree):
     loaded = load_refiner(make_refined_run(tmp_path, trained_walls, moved=0.25, keep=0.4, by="opacity"))
+    assert loaded.settings == PruneSettings(0.4, "opacity")
     dense = normal_scene(60, degree, seed=7)
     small = loaded(loaded.settings.prune(dense))
     pruned = prune(dense, 0.4, "opacity")

@@ -117,23 +117,21 @@ def test_settings_prune_as_prune_does(keep, count):
     assert same(with_options, prune(scene, count, "authors", opacity_weight=0.9))
 
 
-@pytest.mark.parametrize("keep", [0, -1, 0.0, 1.5, 7.25, math.nan, math.inf])
-def test_settings_refuse_a_budget_that_is_neither_a_ratio_nor_a_count(keep):
-    with pytest.raises(BudgetError, match="expected a ratio above 0 and up to 1 .* or a whole number of Gaussians"):
-        PruneSettings(keep)
-
-
 @pytest.mark.parametrize(
-    ("by", "weight", "message"),
+    ("options", "message"),
     [
-        *((by, None, f"{by} looks at a scene from poses; expected a method that needs none") for by in WITH_VIEWS),
-        ("best", None, UNKNOWN),
-        ("merge", 0.5, "merge does not weigh opacity; .* one of paper, authors, log-volume$"),
+        *(
+            ({"keep": keep}, "expected a ratio above 0 and up to 1 .* or a whole")
+            for keep in (0, -1, 1.5, 7.25, math.nan)
+        ),
+        *(({"by": by}, f"{by} looks at a scene from poses; expected a method that needs none") for by in WITH_VIEWS),
+        ({"by": "best"}, UNKNOWN),
+        ({"opacity_weight": 0.5}, "merge does not weigh opacity; .* one of paper, authors, log-volume$"),
     ],
 )
-def test_settings_refuse_what_prune_refuses_and_methods_that_need_views(by, weight, message):
+def test_settings_refuse_what_fits_no_scene_and_methods_that_need_views(options, message):
     with pytest.raises(PointSplatError, match=message):
-        PruneSettings(0.3, by, opacity_weight=weight)
+        PruneSettings(**{"keep": 0.3, **options})
 
 
 @pytest.mark.parametrize(
