@@ -21,6 +21,7 @@ from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos, mean_psnr
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.lenses import lens_of
 from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_named_views, transforms_beside
 from pointsplat_ns.io.camera_files.colmap import model_folder
 from pointsplat_ns.io.files import bytes_text, logger, require_memory
@@ -84,7 +85,7 @@ def read_posed_photos(
     reader = PhotoReader(masks, side)
     taken = sum(math.prod(reader.size(files[index], named.cameras[index])) for index in indices)
     try:
-        require_memory(folder, 4 * taken)  # with a mask
+        require_memory(folder, taken * (4 if any(named.cameras[index].mask for index in indices) else 3))
     except SceneError as error:
         raise DataError(f"{error}: lower --resolution") from error
     examples = _read_all(reader, named, views, files, progress)
@@ -96,8 +97,9 @@ def read_posed_photos(
     names = sorted(indices, key=lambda index: named.names[index])
     held = [index for index in names[::8] if index not in left_out]
     training = [index for index in names if index not in held and index not in left_out]
+    bent = any(lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in indices)
     logger.info(
-        "photos: %d of %s, poses of %s; %d are held out; %s in memory",
+        "photos: %d of %s" + (", undistorted" if bent else "") + ", poses of %s; %d are held out; %s in memory",
         len(examples), folder, model, len(held), bytes_text(sum(_bytes_of(examples[i]) for i in examples)),
     )  # fmt: skip
     return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held], model)

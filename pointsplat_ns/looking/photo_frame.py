@@ -82,7 +82,9 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
 
 
 def _fits(found: Likeness) -> bool:
-    return found.own >= LEAST_LIKENESS and found.own - found.others >= POSE_CHECK.min_advantage
+    """Whether renders are like their photos, and more than like the photos of other views, which show the same object
+    or sky: by three tenths of what is possible. Right frames have six tenths and more."""
+    return found.own >= max(LEAST_LIKENESS, found.others + 0.3 * (1 - found.others))
 
 
 class _Search:
@@ -117,7 +119,7 @@ class _Search:
         found = given = self.fit(self.poses)
         words, poses = "", self.poses
         others = [self._known]
-        if given.own < 0.75:
+        if given.own < 0.75 or not _fits(given):
             others.append([*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])])
         for frames in others:
             text, best = max(frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own)
