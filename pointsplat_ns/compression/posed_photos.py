@@ -45,8 +45,6 @@ class PosedPhotos:
     """The views of all cameras of the file."""
     training: Photos
     held_out: Photos
-    model: Path
-    """The file of cameras."""
 
 
 def read_posed_photos(
@@ -102,7 +100,7 @@ def read_posed_photos(
         "photos: %d of %s" + (", undistorted" if bent else "") + ", poses of %s; %d are held out; %s in memory",
         len(examples), folder, model, len(held), bytes_text(sum(_bytes_of(examples[i]) for i in examples)),
     )  # fmt: skip
-    return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held], model)
+    return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held])
 
 
 def held_out_text(dense: Gaussians, result: Compacted, photos: Photos) -> str:
@@ -194,7 +192,7 @@ def _bytes_of(example: Example) -> int:
 
 def _outliers(dense: Gaussians, examples: dict[int, Example], progress: Progress) -> dict[int, float]:
     """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four standard deviations,
-    estimated from the median deviation. Of ten captures, two photos of one are among them."""
+    estimated from the median deviation. Of seven captures, two photos of one are among them."""
     drawn = thinned(dense, POSE_CHECK.max_count)
     psnrs = {}
     for done, (index, example) in enumerate(examples.items()):
