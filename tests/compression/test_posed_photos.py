@@ -179,7 +179,7 @@ def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, mo
     with pytest.raises(SceneError, match="no such file"):
         read_posed_photos(scene, folder, tmp_path / "none.json")
     write_photos(scene, views, folder)
-    free = psutil.virtual_memory()._replace(available=200_000)
+    free = psutil.virtual_memory()._replace(available=100_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     with pytest.raises(DataError, match="lower --resolution"):
         read_posed_photos(scene, folder)
