@@ -8,7 +8,7 @@ from pointsplat_ns.nerfstudio_plugin.registration import errors_in_one_line, loa
 
 
 def _splatfacto_cpu() -> MethodSpecification:
-    from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+    from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import splatfacto_cpu_config
 
     allow_splatfacto_checkpoints()

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from pointsplat_ns.rasterizer import rasterization, render
     from pointsplat_ns.scene_folder import SceneResult
     from pointsplat_ns.scene_info import SceneInfo, info
-    from pointsplat_ns.tradeoff.measure import measure_tradeoff
     from pointsplat_ns.tradeoff.points import Tradeoff
+    from pointsplat_ns.tradeoff.table import measure_tradeoff
     from pointsplat_ns.views import View, Views
 
 _PUBLIC = {
@@ -65,7 +65,7 @@ _PUBLIC = {
     "pointsplat_ns.metrics": ("psnr", "ssim"),
     "pointsplat_ns.metrics.lpips": ("lpips",),
     "pointsplat_ns.nerfstudio_plugin.dataset_views": ("dataset_views",),
-    "pointsplat_ns.tradeoff.measure": ("measure_tradeoff",),
+    "pointsplat_ns.tradeoff.table": ("measure_tradeoff",),
     "pointsplat_ns.rasterizer": ("rasterization", "render"),
     "pointsplat_ns.tradeoff.points": ("Tradeoff",),
     "pointsplat_ns.views": ("View", "Views"),

@@ -25,8 +25,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
-from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.folder import check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.levels.stream import Chunks, check_stream_folder
@@ -37,7 +36,7 @@ from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.targets import targets_of
+from pointsplat_ns.tradeoff.search import targets_of
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.posed_photos import PosedPhotos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.looking.view_source import ViewSource
-    from pointsplat_ns.tradeoff.targets import Targets
+    from pointsplat_ns.tradeoff.search import Targets
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -64,13 +66,13 @@ class Looking:
 
 @normal_mode
 def prune_source(
-    scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False, compared: bool = False
+    scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False, compared: str = ""
 ) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
     """Read a scene and prune it; notes are logged.
 
     Returns:
-        The dense scene, the smaller scene, the seconds of pruning, and if ``compared`` how close both are; None if
-        there are no views.
+        The dense scene, the smaller scene, the seconds of pruning, and how close both are, if ``compared`` is the
+        suffix of the file to be written; None if there are no views.
     """
     from pointsplat_ns.compression.prune import prune_scene
     from pointsplat_ns.compression.quality import quality_of_pruned
@@ -79,8 +81,9 @@ def prune_source(
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
-        seconds = time.perf_counter() - start
-        quality = quality_of_pruned(dense, pruned, source) if compared else None
+        seconds, quality = time.perf_counter() - start, None
+        if compared:
+            quality = _as_written(lambda scene: quality_of_pruned(dense, scene, pruned, source), pruned.scene, compared)
     log(pruned.notes)
     return dense, pruned.scene, seconds, quality
 
@@ -92,14 +95,14 @@ def compact_source(
     targets: Targets | None,
     looking: Looking,
     progress: bool | Progress = False,
-    compared: bool = False,
+    compared: str = "",
 ) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
     """Read a scene and compact it, or search for targets; verdicts and notes are logged. A search uses only method,
     refiner, effort and format of the request, and decides the rest.
 
     Returns:
-        The dense scene, the result, and if ``compared`` how close both are at full size, in the views that no repair
-        uses; None if there are no views.
+        The dense scene, the result, and how close both are at full size, in the views that no repair uses, if
+        ``compared`` is the suffix of the file to be written; None if there are no views.
     """
     from pointsplat_ns.compression.quality import quality_if_seen
 
@@ -117,20 +120,35 @@ def compact_source(
                 photos = _training_photos(dense, scene, looking.data)
             result = compact_scene(dense, request, source, report, photos)
         else:
-            from pointsplat_ns.tradeoff.finding import find_scene
-            from pointsplat_ns.tradeoff.measure import subject_of
-            from pointsplat_ns.tradeoff.settings import repairs_of
+            from pointsplat_ns.tradeoff.making import subject_of
+            from pointsplat_ns.tradeoff.points import repairs_of
+            from pointsplat_ns.tradeoff.search import find_scene
 
             run, size, upward, data = looking.run_of(scene), looking.size, looking.upward, looking.data
             subject = subject_of(dense, run, source.given, request.refiner, request.prune.suffix, size, upward, data)
             result = find_scene(subject, targets, request.prune.by, repairs_of(request.repair.effort), report)
-        quality = quality_if_seen(dense, result.scene, source.whole) if compared else None
+        quality = None
+        if compared:
+            quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), result.scene, compared)
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
     if posed is not None and posed.held_out:
         from pointsplat_ns.compression.posed_photos import held_out_text
 
         log((held_out_text(dense.to(request.device), result, posed.held_out),))
     return dense, result, quality
+
+
+def _as_written(
+    quality_of: Callable[[Gaussians], FullSizeQuality | None], scene: Gaussians, suffix: str
+) -> FullSizeQuality | None:
+    """Quality of a scene; where it does not differ from the dense scene, that of its file, which may round numbers."""
+    from pointsplat_ns.tradeoff.making import through_file
+
+    quality = quality_of(scene)
+    if quality is not None and quality.psnr == math.inf:
+        written = through_file(scene, suffix)[1]
+        quality = quality if written is scene else quality_of(written)
+    return quality
 
 
 def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]:

@@ -16,7 +16,7 @@ from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_like, format_to_write
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
@@ -32,10 +32,9 @@ from pointsplat_ns.scene_folder import (
 )
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.finding import find_scene
-from pointsplat_ns.tradeoff.measure import subject_of
-from pointsplat_ns.tradeoff.settings import Repair, repairs_of
-from pointsplat_ns.tradeoff.targets import Targets, targets_of
+from pointsplat_ns.tradeoff.making import subject_of
+from pointsplat_ns.tradeoff.points import Repair, repairs_of
+from pointsplat_ns.tradeoff.search import Targets, find_scene, targets_of
 
 
 @normal_mode
@@ -205,7 +204,7 @@ class _Pruning:
     def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> tuple[Gaussians, float | None]:
         """The smaller scene, and its PSNR against renders of the dense one, dB."""
         pruned = prune_scene(dense, request, source)
-        quality = quality_of_pruned(dense, pruned, source)
+        quality = quality_of_pruned(dense, pruned.scene, pruned, source)
         return pruned.scene, None if quality is None else quality.psnr
 
 

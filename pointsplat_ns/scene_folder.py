@@ -24,12 +24,20 @@ from typing import Any, Literal
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.csv_tables import write_csv
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import content_hash, json_text, logger, one_line, read_text, replacing, write_json
+from pointsplat_ns.io.files import (
+    content_hash,
+    json_text,
+    logger,
+    one_line,
+    read_text,
+    replacing,
+    require_memory,
+    write_csv,
+    write_json,
+)
 from pointsplat_ns.io.formats import format_like, format_to_read, format_to_write
-from pointsplat_ns.io.scene import read_scene, save_as
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs
@@ -251,6 +259,8 @@ def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -
             if not held:
                 return None
             shutil.rmtree(task.unfinished, ignore_errors=True)  # of a killed process
+            for part in source_parts(task.source):
+                require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
             text = json.dumps([source_file(task.source).sha256, dict(command.options)], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)

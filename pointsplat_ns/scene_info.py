@@ -15,12 +15,11 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.io.files import unusable_kept
 from pointsplat_ns.io.formats import FORMATS, Format
 from pointsplat_ns.io.formats.sog import sog_bytes_like
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.io.scene import kind_of, read_scene
-from pointsplat_ns.io.source import source_parts
+from pointsplat_ns.io.scene import kind_of, read_scene, source_parts
+from pointsplat_ns.io.usable import unusable_kept
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named

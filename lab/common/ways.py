@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from lab.common.programs import ProgramFailed, Usage, run_measured
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply
-from pointsplat_ns.system.programs import ProgramFailed, Usage, run_measured
 
 Way = Literal["prune", "compact", "thorough"]
 

@@ -20,13 +20,13 @@ import torch
 import tyro
 
 from lab.common.printing import console, save_figure, table
+from lab.common.programs import run_measured
 from lab.common.results import Results, Row, grouped
 from lab.common.ways import PEER, SplatTransform, Way, pointsplat_command
 from lab.judge.record import OURS
 from lab.judge.scenes import JudgedScene, check, load, losses
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
-from pointsplat_ns.system.programs import run_measured
 from pointsplat_ns.system.progress import tracked
 
 

@@ -24,6 +24,7 @@ from rich.table import Table
 
 from lab.common.compare import METRICS, lpips_or_none
 from lab.common.printing import console, megabytes, number, percent, table
+from lab.common.programs import ProgramFailed
 from lab.common.results import Results, Row
 from lab.common.scenes import JUDGED, TUNING, group_of
 from lab.common.ways import WAYS, Reducer, Way, count_of, programs_of
@@ -34,7 +35,6 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics.lpips import Lpips
-from pointsplat_ns.system.programs import ProgramFailed
 from pointsplat_ns.system.progress import tracked
 
 Task = tuple[float, Reducer]

@@ -131,7 +131,7 @@ class Trainings:
         """pointsplat, of that run and a file; ``of_a_scene`` comes before."""
         from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
 
-        ps.save(ps.example_room()[:: self.every], self.folder / "runs" / "room.ply")
+        ps.save(ps.example_room()[:: self.every], self.folder / "runs" / "room.ply", overwrite=True)
 
         def config() -> Any:
             made = pointsplat_config()

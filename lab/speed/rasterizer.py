@@ -9,6 +9,7 @@ CPU seconds of one thread. gsplat on a GPU is measured by cuda.py.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,11 @@ from lab.common.scenes import room
 from lab.common.timing import now, timed, use_cpu_time
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.metrics import psnr
-from pointsplat_ns.rasterizer import binning, rasterization
+from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.blending import blend
-from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread
 
@@ -80,13 +81,10 @@ class Case:
         seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
         colors = sh_to_color(seen.directions, self.tensors[4], 3, seen.ids)
         leaves = [t.detach().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, colors)]
-        geometry = [t.detach() for t in leaves[:4]]
-        engine = binning.engine_of(None, *geometry)
-        footprints = Footprints(
-            *geometry, seen.depth_keys, torch.zeros_like(seen.ids), 1, self.width, self.height, engine=engine
-        )
+        seen = replace(seen, **dict(zip(("means2d", "cov2d", "det", "opacities"), leaves, strict=False)))
+        footprints = Footprints(seen, None, 1, self.width, self.height)
         marks = [now()]
-        drawn = blend(*leaves, footprints)
+        drawn = blend(seen, leaves[4], footprints)
         marks.append(now())
         torch.autograd.grad(drawn, leaves, (self.grads[0][None], -self.grads[1][None]))
         marks.append(now())

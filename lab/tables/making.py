@@ -26,7 +26,7 @@ from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Examp
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
 from pointsplat_ns.rasterizer import render

@@ -32,7 +32,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.outputs import claimed_folder
 from pointsplat_ns.io.runs import may_be_run, name_of, open_run
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes

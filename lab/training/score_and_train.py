@@ -59,7 +59,7 @@ def main(
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
     trained = photo_repair(pruned, dense, training_photos(run), views, budget)
     print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in {trained.compared} photos")
-    ps.save(trained.scene, output)
+    ps.save(trained.scene, output, overwrite=True)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ import tyro
 
 from lab.common.compare import lpips_or_none, metrics_of, photos_of
 from lab.common.printing import markdown, percent, start
+from lab.common.programs import run_measured
 from lab.common.results import Results, Row, grouped
 from lab.common.running import folder_of_run
 from lab.common.ways import count_of
@@ -38,7 +39,6 @@ from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.rasterizer import render
-from pointsplat_ns.system.programs import run_measured
 
 DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, short", "cap, long"
 """Names of the dense scene and of trainings with a cap: without and with the seconds of the dense training."""

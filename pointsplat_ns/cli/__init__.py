@@ -153,45 +153,16 @@ def _ignore_matplotlibrc() -> None:
         os.chdir(here)
 
 
-def _command(name: str) -> Callable[..., None]:
-    """The function of a command, in the module of the same name."""
-    name = name.replace("-", "_")
-    return getattr(importlib.import_module(f"{__package__}.{name}"), name)
-
-
-def _all(args: list[str]) -> dict[str, Callable[..., None]]:
-    """All commands, for the program's help, shell completion, and calls without a command."""
-    commands = {name: _command(name) for name in COMMANDS}
-    if args in (["-h"], ["--help"]):
-        return _redescribed(commands, _first_sentence)
-    if args and args[0].startswith("--tyro-"):
-        return _redescribed(commands, _options_in_lines)
-    return commands
-
-
-def _redescribed(
-    commands: dict[str, Callable[..., None]], describe: Callable[[str], str]
-) -> dict[str, Callable[..., None]]:
-    """The same commands with other docstrings."""
-
-    def with_text(command: Any) -> Callable[..., None]:
-        # A copy, because tyro unwraps wrappers.
-        same = types.FunctionType(command.__code__, command.__globals__, command.__name__, command.__defaults__)
-        same.__annotations__, same.__kwdefaults__ = command.__annotations__, command.__kwdefaults__
-        same.__doc__ = describe(inspect.getdoc(command) or "")
-        return same
-
-    return {name: with_text(command) for name, command in commands.items()}
-
-
-def _first_sentence(text: str) -> str:
-    """The first sentence, for the list of commands."""
-    return re.split(r"(?<=\.)\s", text, maxsplit=1)[0]
-
-
-def _options_in_lines(text: str) -> str:
-    """A docstring with each option on one line: bash completion of tyro 1.0 takes further lines for further words."""
-    return re.sub(r"\n {8,}", " ", text)
+def _command(name: str, short: bool = False) -> Callable[..., None]:
+    """The function of a command, in the module of the same name, with each option of its docstring on one line, as
+    tyro's help and its completion in bash want it; if ``short``, with the first sentence alone. It is a copy, because
+    tyro unwraps wrappers."""
+    command: Any = getattr(importlib.import_module(f"{__package__}.{name}"), name)
+    same = types.FunctionType(command.__code__, command.__globals__, command.__name__, command.__defaults__)
+    same.__annotations__, same.__kwdefaults__ = command.__annotations__, command.__kwdefaults__
+    text = inspect.getdoc(command) or ""
+    same.__doc__ = re.split(r"(?<=\.)\s", text, maxsplit=1)[0] if short else re.sub(r"\n {8,}", " ", text)
+    return same
 
 
 def program() -> NoReturn:
@@ -256,7 +227,8 @@ def _run(args: list[str]) -> None:
             else:
                 about = "Makes trained 3D Gaussian Splatting scenes smaller, and looks at them."
                 about += " `--version` prints the version."
-                tyro.extras.subcommand_cli_from_dict(_all(args), prog="pointsplat", description=about, args=args)
+                commands = {name: _command(name, short=args in (["-h"], ["--help"])) for name in COMMANDS}
+                tyro.extras.subcommand_cli_from_dict(commands, prog="pointsplat", description=about, args=args)
     except SystemExit as end:
         if not end.code and (text := after_help(args)):
             print(f"\n{text}")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
-    Json,
     end_if_interrupted,
     print_distributions,
     print_json,
@@ -19,25 +19,9 @@ from pointsplat_ns.cli.printing import (
     scene_result,
     written_size,
 )
-from pointsplat_ns.cli.scene_options import (
-    Bands,
-    Data,
-    Megabytes,
-    Output,
-    Poses,
-    Resolution,
-    Scene,
-    Up,
-    check_poses,
-    claim_outputs,
-    need_no_folder_options,
-    output_beside,
-    scene_written,
-)
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
-    from pointsplat_ns.compression.trained_refiner import TrainedRefiner
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -61,33 +45,33 @@ Photos = Annotated[
 
 
 def compact(
-    scene: Scene,
-    output: Output = None,
+    scene: options.Scenes,
+    output: options.Output = None,
     keep: str | None = None,
     refiner: Annotated[Path | None, tyro.conf.arg(aliases=["--using"])] = None,
     by: str | None = None,
-    sh: Bands = "all",
+    sh: options.Bands = "all",
     clean: bool = False,
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
     photos: Photos = False,
     target_db: float | None = None,
     target_ms: float | None = None,
-    target_mb: Megabytes | None = None,
-    poses: Poses = None,
-    resolution: Resolution = None,
-    up: Up = None,
-    data: Data = None,
+    target_mb: options.Megabytes | None = None,
+    poses: options.Poses = None,
+    resolution: options.Resolution = None,
+    up: options.Up = None,
+    data: options.Data = None,
     picture: Path | None = None,
     html: Path | None = None,
-    html_limit: Megabytes = 60.0,
+    html_limit: options.Megabytes = 60.0,
     dry_run: bool = False,
-    force: bool = False,
-    jobs: int | None = None,
-    shard: str | None = None,
-    threads: int | None = None,
-    verbose: bool = False,
-    json_output: Json = False,
+    force: options.Force = False,
+    jobs: options.Jobs = None,
+    shard: options.Shard = None,
+    threads: options.Threads = None,
+    verbose: options.Verbose = False,
+    json_output: options.Json = False,
 ) -> None:
     """Make any scene smaller and repair it, or all scenes of a folder. No photos are needed.
 
@@ -101,7 +85,6 @@ def compact(
     after an interruption. It may also run several times at once, or on several machines that share the folder.
 
     Args:
-        scene: a file of any format, a checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
             room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
             rooms_compact beside rooms. Each result there has the format of its scene.
@@ -123,29 +106,14 @@ def compact(
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
             within the limits.
         target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
-        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a
-            COLMAP project; for one scene. By default the views of its dataset, or of such a file beside the scene, or
-            sampled ones; none always samples them.
-        resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
-            default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
-            file's own, or an estimate. Write --up=-y for a negative axis.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says. In a folder
-            of scenes, a run whose data is not found gets sampled views, which its note says.
         picture: a .png file for images of some views: dense, before and after the repair, side by side; by default
             none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them; by default none.
         html_limit: largest size of that file, MB. If both scenes take more, the dense one is left out.
         dry_run: compute and print everything, but write no scene.
-        force: overwrite existing files.
-        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
-        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
-        threads: number of threads of each process. By default it adapts to the work and to other programs. Another
-            number may change results by rounding.
-        verbose: print more: what was chosen for the scene, and the distributions of opacities and sizes.
-        json_output: print the result as JSON, and nothing else on standard output.
     """
+    options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
@@ -161,29 +129,32 @@ def compact(
             target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, data=data,
             shard=shard, force=force,
         )  # fmt: skip
-    need_no_folder_options(scene, jobs, shard)
+    options.need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import Looking, compact_source
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
+    from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.pages.scene_page import check_limit
-    from pointsplat_ns.tradeoff.targets import targets_of
+    from pointsplat_ns.tradeoff.search import targets_of
 
-    check_poses(poses)
-    output = output or output_beside(scene, "compact")
+    options.check_poses(poses)
+    output = output or options.output_beside(scene, "compact")
     written = None if dry_run else output
-    claim_outputs(written, force, picture, html)
+    options.claim_outputs(written, force, picture, html)
     check_limit(html_limit)
     kind = format_to_write(output)
     request = CompactRequest.of(
-        _loaded(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
+        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
     )
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
     looking = Looking(poses, resolution, up, data, photos if isinstance(photos, Path) else None)
     with fixed_threads(threads):
-        dense, result, quality = compact_source(scene, request, targets, looking, progress=True, compared=True)
+        dense, result, quality = compact_source(
+            scene, request, targets, looking, progress=True, compared=kind.budget_suffix
+        )
     if not dry_run:
-        ps.save(result.scene, output, progress=True)
-    with scene_written(written):
+        ps.save(result.scene, output, progress=True, overwrite=True)
+    with options.scene_written(written):
         shown = None if picture is None else ps.plot_comparison(dense, result, picture)
         if html is not None:
             _write_page(scene, dense, result, html, html_limit, up)
@@ -209,15 +180,6 @@ def compact(
     if html is not None:
         print(f"{html}: {written_size(html)}, to fly through in a browser")
     end_if_interrupted(result.interrupted)
-
-
-def _loaded(refiner: Path | None) -> TrainedRefiner | None:
-    """The trained refiner at a path; None for none."""
-    if refiner is None:
-        return None
-    from pointsplat_ns.compression.trained_refiner import refiner_at
-
-    return refiner_at(refiner)
 
 
 def _write_page(path: Path, dense: Gaussians, result: Compacted, html: Path, limit_mb: float, up: str | None) -> None:

@@ -10,14 +10,14 @@ from typing import Any, Literal
 
 import tyro
 
+from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
-from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
-from pointsplat_ns.cli.scene_options import Scene, claim_outputs, need_no_folder_options
+from pointsplat_ns.cli.printing import print_json, scene_result, written_size
 from pointsplat_ns.system.quantities import seconds_text
 
 
 def convert(
-    scene: Scene,
+    scene: options.Scenes,
     output: tyro.conf.Positional[Path],
     sh: Literal["all", "0", "1", "2", "3"] = "all",
     up: str | None = None,
@@ -28,10 +28,10 @@ def convert(
     spz_version: Literal[3, 4] = 3,
     spz_sh_bits: tuple[int, int] | None = None,
     to: str | None = None,
-    force: bool = False,
-    jobs: int | None = None,
-    shard: str | None = None,
-    json_output: Json = False,
+    force: options.Force = False,
+    jobs: options.Jobs = None,
+    shard: options.Shard = None,
+    json_output: options.Json = False,
 ) -> None:
     """Write a scene in another format, or all scenes of a folder. What formats lose stands in docs/formats.md.
 
@@ -52,11 +52,8 @@ def convert(
         spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
             larger file and a better picture. By default 6 and 5; SH from an .spz file stay as they are.
         to: for a folder: the format of all results, such as .spz; by default none.
-        force: overwrite existing files.
-        jobs: for a folder: number of processes that share its scenes and the cores; by default 1.
-        shard: for a folder: only a part of its scenes; 2/5 is the second of five; by default all.
-        json_output: print the result as JSON, and nothing else on standard output.
     """
+    options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.formats.registry import writer
@@ -78,10 +75,10 @@ def convert(
             convert_folder, scene, output, one, json_output, jobs,
             suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, offset=point, shard=shard, force=force,
         )  # fmt: skip
-    need_no_folder_options(scene, jobs, shard)
+    options.need_no_folder_options(scene, jobs, shard)
     if to is not None:
         raise ps.SceneError(f"{scene}: one scene; --to is for a folder of scenes, the name of {output} says its format")
-    claim_outputs(output, force)
+    options.claim_outputs(output, force)
     start = time.perf_counter()
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))

@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,26 +20,17 @@ if TYPE_CHECKING:
     from pointsplat_ns.gaussians import Gaussians
 
 
-@dataclass(frozen=True)
-class DemoSettings:
+class DemoSettings(NamedTuple):
     """Choices of the demo, which has no options for them: as little as shows something."""
 
-    keep: str = "10%"
-    """Budget of the scene that ships."""
+    keep: str = "10%"  # budget of the scene that ships
     photos: int = 30
-    """Photos of the capture."""
-    size: tuple[int, int] = (192, 144)
-    """Width and height of a photo, pixels."""
-    walk: float = 1.3
-    """Radius of the circle that photos are taken from, metres; the room reaches 2.4 m from its middle."""
-    every: int = 5
-    """Each so many-th Gaussian of the scene is a point that the training starts from."""
+    size: tuple[int, int] = (192, 144)  # width and height of a photo, pixels
+    walk: float = 1.3  # radius of the circle of photos, metres; the room reaches 2.4 m from its middle
+    every: int = 5  # each so many-th Gaussian of the scene is a point that the training starts from
     scene_steps: int = 300
-    """Training steps of the scene."""
     refiner_steps: int = 40
-    """Training steps of the refiner."""
-    name: str = "demo"
-    """Name of the folders that a second call replaces: those of the capture and the runs."""
+    name: str = "demo"  # of the folders that a second call replaces: those of the capture and the runs
 
 
 DEMO = DemoSettings()
@@ -78,7 +68,7 @@ def write_example(path: Path, force: bool) -> None:
 
     claim_outputs(path, force)
     scene = ps.example_room()
-    ps.save(scene, path)
+    ps.save(scene, path, overwrite=True)
     print(f"{path}: {len(scene):,} Gaussians, {written_size(path)}")
 
 
@@ -88,7 +78,7 @@ def compact_example(output: Path) -> list[Row]:
 
     dense, small = output / "example.ply", output / "example_compact.ply"
     page, pictures, result = output / "example.html", output / "example.png", output / "compact.json"
-    ps.save(ps.example_room(), dense)
+    ps.save(ps.example_room(), dense, overwrite=True)
     run(
         f"Make the room that ships small: {DEMO.keep} of its Gaussians, merged and repaired.",
         ["pointsplat", "compact", dense, "--keep", DEMO.keep, "-o", small, "--picture", pictures, "--html", page]
@@ -236,12 +226,9 @@ class Row(NamedTuple):
     scene: str
     variant: str
     gaussians: int
-    bytes: float
-    """Of a PLY of float32."""
-    psnr: float | None
-    """dB."""
-    reference: str
-    """What the PSNR is against."""
+    bytes: float  # of a PLY of float32
+    psnr: float | None  # dB
+    reference: str  # of the PSNR
 
 
 def show_results(rows: list[Row]) -> None:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json, scene_result, written_size
-from pointsplat_ns.cli.scene_options import Data, claim_outputs
+from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.cli.printing import print_json, scene_result, written_size
 from pointsplat_ns.system.quantities import seconds_text
 
 
@@ -17,9 +17,9 @@ def export(
     run: tyro.conf.Positional[Path],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     scene: str | None = None,
-    data: Data = None,
-    force: bool = False,
-    json_output: Json = False,
+    data: options.Data = None,
+    force: options.Force = False,
+    json_output: options.Json = False,
 ) -> None:
     """Write the refined scene of a pointsplat run, or the trained one of a Splatfacto run, as a file of any format.
 
@@ -28,15 +28,14 @@ def export(
         output: the file to write, of any format as for prune.
         scene: name of a scene of a pointsplat run; by default the first held-out one, or else the first.
         data: folder of the scenes of a pointsplat run, or one above it, if they are no longer where the run says.
-        force: overwrite an existing file.
-        json_output: print the result as JSON, and nothing else on standard output.
     """
+    options.need_scenes(run)
     import pointsplat_ns as ps
 
-    claim_outputs(output, force)
+    options.claim_outputs(output, force)
     start = time.perf_counter()
     exported = ps.load(run, scene, data)
-    ps.save(exported, output, progress=True)
+    ps.save(exported, output, progress=True, overwrite=True)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(None, exported, seconds, output))

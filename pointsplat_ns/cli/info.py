@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
-from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import Data, Resolution, Up, claim_outputs
+from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.cli.printing import print_json
 
 if TYPE_CHECKING:
     from pointsplat_ns.scene_info import SceneInfo
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
 def info(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
     views: Path | None = None,
-    resolution: Resolution = None,
-    up: Up = None,
-    data: Data = None,
-    force: bool = False,
-    json_output: Json = False,
+    resolution: options.Resolution = None,
+    up: options.Up = None,
+    data: options.Data = None,
+    force: options.Force = False,
+    json_output: options.Json = False,
 ) -> None:
     """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, rows that look wrong, and what
     files of other formats would weigh. Several, and all scenes of a folder, make a table.
@@ -31,19 +32,14 @@ def info(
         scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of scenes.
         views: a .png file for a sheet of the views that other commands use without --poses, for one scene; by default
             none.
-        resolution: size of views, pixels. By default the size of the photos for the sheet, if there are any, else
-            1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
-            file's own, or an estimate. Write --up=-y for a negative axis.
-        data: for the sheet of a run: folder of its photos and poses, or one above it, if it is no longer where the run
-            says.
-        force: overwrite an existing file.
         json_output: print JSON, and nothing else on standard output: an object, or a list for several scenes.
     """
     import pointsplat_ns as ps
     from pointsplat_ns.errors import PointSplatError
 
-    claim_outputs(None, force, views)
+    if not any(map(os.path.exists, scenes)):
+        options.need_scenes(*scenes)
+    options.claim_outputs(None, force, views)
     scenes = tuple(path for scene in scenes for path in _scenes_of(scene))
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
@@ -61,10 +57,10 @@ def info(
     if json_output:
         rows = [*(one.as_dict() for one in found), *failed]
         print_json(rows if len(rows) > 1 else rows[0])
-    elif len(scenes) > 1:
-        _print_table(found)
-    else:
+    elif len(scenes) == 1:
         _print(found[0])
+    elif found:
+        _print_table(found)
     if sheet is not None and not json_output:
         print(sheet)
     if failed:

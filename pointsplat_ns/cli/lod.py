@@ -7,19 +7,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import (
-    Bands,
-    Data,
-    Output,
-    Poses,
-    Resolution,
-    Scene,
-    Up,
-    check_poses,
-    need_one_scene,
-    output_beside,
-)
+from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.cli.printing import print_json, psnr_text
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
@@ -27,21 +16,21 @@ if TYPE_CHECKING:
 
 
 def lod(
-    scene: Scene,
+    scene: options.Scene,
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
-    output: Output = None,
+    output: options.Output = None,
     stream: bool = False,
     html: bool = False,
     chunk_count: int = 512,
     chunk_extent: float | None = None,
-    sh: Bands = "all",
-    poses: Poses = None,
-    resolution: Resolution = None,
-    up: Up = None,
-    data: Data = None,
-    force: bool = False,
-    threads: int | None = None,
-    json_output: Json = False,
+    sh: options.Bands = "all",
+    poses: options.Poses = None,
+    resolution: options.Resolution = None,
+    up: options.Up = None,
+    data: options.Data = None,
+    force: options.Force = False,
+    threads: options.Threads = None,
+    json_output: options.Json = False,
 ) -> None:
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
@@ -53,7 +42,6 @@ def lod(
     from sampled poses.
 
     Args:
-        scene: a file of any format, a checkpoint, or a run (its folder or config.yml).
         levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
@@ -66,27 +54,17 @@ def lod(
         chunk_count: Gaussians in a chunk of a stream, thousands of 1024, about.
         chunk_extent: largest side of a leaf of a stream, scene units. By default an eighth of the content's diagonal.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
-        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the root of a COLMAP project;
-            by default the views of its dataset, or of such a file beside the scene, or sampled ones; none always
-            samples them.
-        resolution: size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By
-            default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
-            file's own, or an estimate. Write --up=-y for a negative axis.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
-        force: overwrite existing files.
-        threads: number of threads. By default it adapts to the work and to other programs. Another number may
-            change results by rounding.
         json_output: print the manifest, and nothing else on standard output.
     """
+    options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.discovery import FOLDER_FILES
     from pointsplat_ns.levels.stream import Chunks
     from pointsplat_ns.system.threads import fixed_threads
 
-    need_one_scene(scene)
-    check_poses(poses)
-    folder = output or output_beside(scene, "stream" if stream else "lod").with_suffix("")
+    options.need_one_scene(scene)
+    options.check_poses(poses)
+    folder = output or options.output_beside(scene, "stream" if stream else "lod").with_suffix("")
     chunks = Chunks(chunk_count << 10, chunk_extent) if stream else None
     with fixed_threads(threads):
         made = ps.lod(
@@ -116,8 +94,8 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"{len(level.scene):,}",
                 f"{100 * len(level.scene) / len(made.dense):.3g} %",
                 three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
-                f"{near.psnr:.1f}" if near else "-",
-                f"{near.worst:.1f}" if near else "-",
+                psnr_text(near.psnr if near else None),
+                psnr_text(near.worst if near else None),
                 f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
                 f"{level.seconds:.1f}",
             )

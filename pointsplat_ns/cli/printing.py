@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import IO, TYPE_CHECKING, Any
 
 from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.ply import PlyRows
-
-Json = Annotated[bool, tyro.conf.arg(name="json")]
 
 _OUTPUT: ContextVar[IO[str] | None] = ContextVar("output", default=None)
 
@@ -85,9 +82,16 @@ def print_result(
     done = f"{', '.join(first)} and {last}" if first else last
     size = bytes_text(ply_bytes(len(scene), scene.sh_degree)) + " as .ply" if where is None else written_size(where)
     place = "dry run, nothing is written" if where is None else where
-    counts = f"{len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
-    print(f"{place}: {done} to {counts}, {size}, in {seconds_text(seconds)}")
+    what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
+    if len(scene) == before and not also:
+        what = f"nothing is {'merged' if by == 'merge' else 'pruned'}, all {before:,} Gaussians fit as they are"
+    print(f"{place}: {what}, {size}, in {seconds_text(seconds)}")
     print(quality or "not compared with the dense scene: nothing of it is visible")
+
+
+def psnr_text(psnr: float | None, digits: int = 1) -> str:
+    """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was compared."""
+    return "-" if psnr is None else "same" if psnr == math.inf else f"{psnr:.{digits}f}"
 
 
 def written_size(where: Path) -> str:

@@ -13,13 +13,69 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
-Scene = tyro.conf.Positional[Path]
+ONE_SCENE = "a file of any format, a checkpoint, or a run (its folder or config.yml)"
+
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=ONE_SCENE)]
+Scenes = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=f"{ONE_SCENE}, or a folder of scenes")]
 Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
-Poses = Path | None
-Data = Path | None
-Resolution = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
-Up = Annotated[str | None, tyro.conf.arg(metavar="AXIS")]
+Poses = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        help="a file of cameras of the scene: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a "
+        "COLMAP project. By default the views of its dataset, or of such a file beside the scene or above it, or "
+        "sampled ones; none always samples them."
+    ),
+]
+Resolution = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="WxH",
+        help="size of the pictures that people look at, pixels. Decisions by rendering are made at this size. By "
+        "default the size of the photos, if there are any, else 1920x1080.",
+    ),
+]
+Up = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="AXIS",
+        help="the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the "
+        "file's own, or an estimate. Write --up=-y for a negative axis.",
+    ),
+]
+Data = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        help="folder of the run's photos and poses, or one above it, if it is no longer where the run says. In a "
+        "folder of scenes, a run whose data is not found gets sampled views, which its note says."
+    ),
+]
 Bands = Literal["all", "auto", "0", "1", "2", "3"]
+Force = Annotated[bool, tyro.conf.arg(help="overwrite existing files.")]
+Jobs = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="for a folder, or for a scene that prune merges in parts: number of processes that share scenes or parts, "
+        "and the cores; by default 1."
+    ),
+]
+Shard = Annotated[
+    str | None,
+    tyro.conf.arg(help="for a folder: only a part of its scenes; 2/5 is the second of five; by default all."),
+]
+Threads = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="number of threads of each process. By default it adapts to the work and to other programs. Another "
+        "number may change results by rounding."
+    ),
+]
+Verbose = Annotated[
+    bool,
+    tyro.conf.arg(help="print more: what was chosen for the scene, and the distributions of opacities and sizes."),
+]
+Json = Annotated[
+    bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")
+]
 
 
 def output_beside(scene: Path, suffix: str) -> Path:
@@ -33,6 +89,23 @@ def output_beside(scene: Path, suffix: str) -> Path:
     if scene.suffix.lower() in (".yml", ".yaml"):
         return scene.with_name(f"{suffix}.ply")
     return scene.with_name(f"{scene.stem}_{suffix}.ply")
+
+
+def need_scenes(*paths: Path | None) -> None:
+    """Raise a SceneError, before torch is imported, that names all paths at which there is nothing."""
+    from pointsplat_ns.errors import SceneError
+
+    gone = []
+    for path in filter(None, paths):
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            gone.append(str(path))
+        except (OSError, ValueError):
+            pass  # the reader says more
+    if gone:
+        what = "no such file" if len(gone) == 1 else "no such files"
+        raise SceneError(f"{', '.join(gone)}: {what}; expected a scene: {ONE_SCENE}")
 
 
 def need_no_folder_options(scene: Path, jobs: int | None, shard: str | None) -> None:

@@ -5,43 +5,34 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Literal
 
-from pointsplat_ns.cli.printing import Json, print_json
-from pointsplat_ns.cli.scene_options import (
-    Data,
-    Megabytes,
-    Output,
-    Poses,
-    Resolution,
-    Scene,
-    Up,
-    check_poses,
-    output_beside,
-)
+from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
-    from pointsplat_ns.tradeoff.points import ImageMetrics, Tradeoff
+    from pointsplat_ns.tradeoff.points import Tradeoff
 
 
 def tradeoff(
-    scene: Scene,
-    output: Output = None,
+    scene: options.Scene,
+    output: options.Output = None,
     keep: tuple[str, ...] | None = None,
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
     sh: tuple[Literal["all", "0", "1", "2", "3"], ...] = ("all",),
     repairs: tuple[Literal["none", "refiner", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
-    poses: Poses = None,
-    resolution: Resolution = None,
-    up: Up = None,
-    data: Data = None,
+    poses: options.Poses = None,
+    resolution: options.Resolution = None,
+    up: options.Up = None,
+    data: options.Data = None,
     target_db: float | None = None,
     target_ms: float | None = None,
-    target_mb: Megabytes | None = None,
-    force: bool = False,
-    threads: int | None = None,
-    json_output: Json = False,
+    target_mb: options.Megabytes | None = None,
+    force: options.Force = False,
+    threads: options.Threads = None,
+    json_output: options.Json = False,
 ) -> None:
     """Measure how a scene trades quality for frame time, size and count, on this machine.
 
@@ -50,8 +41,6 @@ def tradeoff(
     instead, and writes it.
 
     Args:
-        scene: a file of any format, a checkpoint, or a run (its folder or config.yml). Held-out photos
-            of a run are used where they are found.
         output: the folder for points, pictures, the table and the page; by default beside the scene: room_tradeoff
             for room.ply, tradeoff in the folder of a run.
         keep: budgets: ratios (30%), counts (50000) or sizes (12MB); by default 70%, 50%, 30%, 20%, 10% and 5%.
@@ -61,31 +50,20 @@ def tradeoff(
         sh: SH degrees to measure: all bands, or those up to a degree.
         repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
-        poses: a file of cameras: cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model;
-            no photos are used then. By default the views of its dataset, or of such a file beside the scene, or sampled
-            ones; none always samples them.
-        resolution: size of the pictures that people look at, pixels. Scenes are made for this size, and judged and
-            timed in the pictures of comparisons. By default the size of the photos, if there are any, else 1920x1080.
-        up: the axis that is up in the scene: x, y, z, -x, -y or -z, for views that are sampled; by default the
-            file's own, or an estimate. Write --up=-y for a negative axis.
-        data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
             there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
             within the limits.
         target_mb: largest file: 12, 12MB, 800kB; by default no limit.
-        force: start over, and overwrite results in the folder.
-        threads: number of threads. By default it adapts to the work and to other programs. Another number may
-            change results by rounding. Frames are timed on all threads.
-        json_output: print the content of tradeoff.json, and nothing else on standard output.
     """
+    options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.system.threads import fixed_threads
-    from pointsplat_ns.tradeoff.front import next_best
-    from pointsplat_ns.tradeoff.results import SWEEP_FILES
+    from pointsplat_ns.tradeoff.points import RESULTS
+    from pointsplat_ns.tradeoff.recommend import next_best
 
-    check_poses(poses)
-    folder = output or output_beside(scene, "tradeoff").with_suffix("")
+    options.check_poses(poses)
+    folder = output or options.output_beside(scene, "tradeoff").with_suffix("")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, keep=keep, within=within, by=by, sh=sh, repairs=repairs, views=views, poses=poses,
@@ -93,7 +71,7 @@ def tradeoff(
             force=force, progress=True,
         )  # fmt: skip
     if json_output:
-        print_json({"output": folder, **json.loads((folder / SWEEP_FILES.json).read_text("utf-8"))})
+        print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})
         return
     _print_table(found)
     for note in found.notes:
@@ -103,7 +81,7 @@ def tradeoff(
     best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
     if best.command:
         print(f"$ {best.command}")
-    print(f"{folder}: table and pictures; open {folder / SWEEP_FILES.page}")
+    print(f"{folder}: table and pictures; open {folder / RESULTS['page']}")
 
 
 def _print_table(found: Tradeoff) -> None:
@@ -112,7 +90,8 @@ def _print_table(found: Tradeoff) -> None:
     from pointsplat_ns.tradeoff.points import speed_of
 
     photos = found.points[0].against_photos is not None
-    print(f"{found.scene}: {len(found.points)} points, {found.width} x {found.height} pixels, {found.views_origin}")
+    count = counted(len(found.points), "point")
+    print(f"{found.scene}: {count}, {found.width} x {found.height} pixels, {found.views_origin}")
     print(found.machine)
     rows = []
     for point in found.points:
@@ -125,26 +104,14 @@ def _print_table(found: Tradeoff) -> None:
                 f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
                 three_digits(point.frame_ms),
                 "-" if point.fill is None else f"{point.fill:.1f}",
-                f"{point.against_dense.psnr:.2f}",
-                *([_psnr(point.against_photos)] if photos else []),
+                psnr_text(point.against_dense.psnr, 2),
+                *([psnr_text(point.against_photos.psnr if point.against_photos else None, 2)] if photos else []),
             )
         )
+    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill", "dB,\nrenders"]
     print_table(
-        (
-            "",
-            "Gaussians",
-            "MB",
-            "times as fast",
-            "ms a\nframe",
-            "fill",
-            "dB,\nrenders",
-            *(["dB,\nphotos"] if photos else []),
-        ),
+        (*columns, *(["dB,\nphotos"] if photos else [])),
         rows,
         "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
         "drawn per pixel; dB of PSNR",
     )
-
-
-def _psnr(quality: ImageMetrics | None) -> str:
-    return "-" if quality is None else f"{quality.psnr:.2f}"

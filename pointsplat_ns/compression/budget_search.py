@@ -22,31 +22,11 @@ from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
 
+FIRST_SHARE = 0.3
+"""Share of the Gaussians at the first try for a PSNR."""
 
-@dataclass(frozen=True)
-class SearchSettings:
-    """When a search ends, and how it steps."""
-
-    precision: float = 1.05
-    """Largest ratio of a count that meets the target to the neighbouring one that misses it."""
-    tolerance: float = 0.0
-    """Distance from the target, in units of the measure, at which a count that meets the target is good enough."""
-    tries: float = math.inf
-    """Largest number of counts tried, once one has met the target."""
-    step_up: float = 2.0
-    """Factor to the next larger count where no slope is known."""
-    step_down: float = 0.25
-    """Factor to the next smaller count where no slope is known."""
-    largest_step: float = 16.0
-    """Largest factor between two counts in an extrapolation."""
-    overshoot: float = 1.05
-    """Factor on an extrapolated step, so that the next two counts enclose the target. 1 where there is a tolerance."""
-    margin: float = 0.03
-    """Share of the interval by which an interpolated count moves to the side that meets the target, so that the last
-    count tried is likely to meet it. 0 where there is a tolerance."""
-    inset: float = 0.15
-    """Least distance of an interpolated count from both ends, as a share of the interval, so that each try narrows
-    it."""
+SLOPE = 6.0
+"""Usual gain of merged scenes for each e-fold of the count, dB."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +47,9 @@ def find_count(
     most: int,
     least: int = 1,
     slope: float | None = None,
-    settings: SearchSettings | None = None,
+    precision: float = 1.05,
+    tolerance: float = 0.0,
+    tries: float = math.inf,
 ) -> FoundCount:
     """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it.
 
@@ -78,13 +60,18 @@ def find_count(
         first: the first count tried.
         most, least: bounds of the count.
         slope: rise of the measure for each e-fold of the count; None if it is not known.
+        precision: the search ends at this ratio of a count that meets the target to one that misses it.
+        tolerance: distance from the target at which a count that meets it is good enough.
+        tries: largest number of counts tried, once one has met the target.
 
     Example:
         >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000).count in range(420, 442)
         True
     """
-    settings = settings or SearchSettings()
-    aimed = target + (0.5 if at_least else -0.5) * settings.tolerance
+    aimed = target + (0.5 if at_least else -0.5) * tolerance
+    # Without a tolerance, interpolated counts move by a share of the interval to the side that meets the target, so
+    # that the last count tried is likely to meet it; and extrapolated steps go further, so that two counts enclose it.
+    margin, overshoot = (0.0, 1.0) if tolerance else (0.03 if at_least else -0.03, 1.05)
     low, high = least - 1, most + 1  # counts below the target, and at or above it; out of bounds until measured
     values: dict[int, float] = {}
     best: int | None = None
@@ -96,35 +83,44 @@ def find_count(
         if below != at_least:
             best = count
         slope = _slope(values, target, slope)
-        close = best is not None and high <= max(low, 1) * settings.precision
-        good_enough = best == count and 0 < settings.tolerance >= abs(value - target)
-        if close or good_enough or high - low <= 1 or (best is not None and len(values) >= settings.tries):
+        close = best is not None and high <= max(low, 1) * precision
+        good_enough = best == count and 0 < tolerance >= abs(value - target)
+        if close or good_enough or high - low <= 1 or (best is not None and len(values) >= tries):
             return FoundCount(best, slope)
         if low in values and high in values:
-            margin = 0.0 if settings.tolerance else settings.margin if at_least else -settings.margin
-            guess = _interpolated(low, high, values[low], values[high], aimed, margin, settings)
+            guess = _interpolated(low, high, values[low], values[high], aimed, margin)
         else:
             tried = low if low in values else high
-            guess = _extrapolated(tried, aimed - values[tried], slope, tried == low, settings)
-        if guess * settings.precision > most and most not in values:
+            guess = _extrapolated(tried, aimed - values[tried], slope, tried == low, overshoot)
+        if guess * precision > most and most not in values:
             guess = most
         count = min(high - 1, max(low + 1, round(guess)))
 
 
-def _interpolated(
-    low: int, high: int, below: float, above: float, aimed: float, margin: float, settings: SearchSettings
-) -> float:
-    """The count where the line through two measured counts reaches ``aimed``, moved by a margin."""
+def find_size(bytes_of: Callable[[int], float], limit: float, first: int, most: int) -> int | None:
+    """Search for nearly the largest count, at most ``most``, whose file has at most ``limit`` bytes; None if there is
+    none. Each try makes a scene, so tries are few, and 95 % of the limit are good enough. Other arguments as for
+    :func:`find_count`."""
+
+    def measure(count: int) -> float:
+        return math.log(bytes_of(count))
+
+    target, tolerance = math.log(max(limit, 1)), -math.log(0.95)
+    return find_count(measure, target, False, first, most, slope=1.0, tolerance=tolerance, tries=4).count
+
+
+def _interpolated(low: int, high: int, below: float, above: float, aimed: float, margin: float) -> float:
+    """The count where the line through two measured counts reaches ``aimed``, moved by a margin, and apart from both,
+    so that each try narrows the interval."""
     share = (aimed - below) / (above - below) + margin if math.isfinite(above - below) and above > below else 0.5
-    return low * (high / low) ** min(1 - settings.inset, max(settings.inset, share))
+    return low * (high / low) ** min(0.85, max(0.15, share))
 
 
-def _extrapolated(tried: int, gap: float, slope: float | None, up: bool, settings: SearchSettings) -> float:
-    """The count where the line through one measured count closes the gap to the target."""
+def _extrapolated(tried: int, gap: float, slope: float | None, up: bool, overshoot: float) -> float:
+    """The count where the line through one measured count closes the gap to the target, at most 16 times as far."""
     if slope is None or not math.isfinite(gap):
-        return tried * (settings.step_up if up else settings.step_down)
-    overshoot = 1.0 if settings.tolerance else settings.overshoot
-    factor = overshoot * math.exp(min(abs(gap) / slope, math.log(settings.largest_step)))
+        return tried * (2.0 if up else 0.25)
+    factor = overshoot * math.exp(min(abs(gap) / slope, math.log(16.0)))
     return tried * factor if up else tried / factor
 
 
@@ -139,37 +135,9 @@ def _slope(values: dict[int, float], target: float, known: float | None) -> floa
     return slope if slope > 0 else None
 
 
-@dataclass(frozen=True)
-class BudgetSettings:
-    """Settings of the searches."""
-
-    sh_psnr: float = 40.0
-    """PSNR, in dB, of renders without some SH bands against renders with all bands, for ``sh="auto"``. An independent
-    error of this size lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
-    first_share: float = 0.3
-    """Share of the Gaussians at the first try for a PSNR."""
-    slope: float = 6.0
-    """Usual gain of merged scenes for each e-fold of the count, dB."""
-    psnr: SearchSettings = SearchSettings(tolerance=0.1)
-    """Search for a PSNR in dB: it ends within 0.1 dB above the target."""
-    size: SearchSettings = SearchSettings(tolerance=-math.log(0.95), tries=4)
-    """Search for the logarithm of a file's size: it ends at 95 % of the limit. Each try makes a scene, so tries are
-    few."""
-    first_bytes: float = 15.0
-    """Bytes of a Gaussian at the first try for a size."""
-    room: float = 0.05
-    """Share of a limit that a file may leave before its numbers are rounded less."""
-    bytes_of_step: float = 0.12
-    """Usual growth of a file where numbers are rounded a step finer, as a logarithm."""
-    roundings: int = 6
-    """Roundings that are tried for a limit, at most."""
-    unknown_psnr: float = 30.0
-    """PSNR, in dB, that scenes are taken to have where there are no views to measure it in, for rounding."""
-    repaired: SearchSettings = SearchSettings(precision=1.1)
-    """Search for PSNR and times of repaired scenes: coarse, because each try makes, repairs and renders a scene."""
-
-
-BUDGETS = BudgetSettings()
+def share_done(tries: float) -> float:
+    """Share done of a search after some tries, of which there are about four. It never jumps."""
+    return 1 - 0.75**tries
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,16 +185,16 @@ class FileLimit:
         if self.most == math.inf:
             return best.to(scene.device)
         steps, fits, exceeds = 0.0, -math.inf, math.inf  # steps finer: those tried, the most that fit, the next
-        for number in range(BUDGETS.roundings):
+        for number in range(6):
             tried = self.kind.rounded(written, rounding.finer(steps)) if number else tried
             room = math.log(self.most / self.bytes_of(tried))
             if room >= 0:
                 best, fits = tried, steps
             else:
                 exceeds = steps
-            if 0 <= room <= BUDGETS.room:
+            if 0 <= room <= 0.05:
                 break
-            steps += (room - 0.5 * BUDGETS.room) / BUDGETS.bytes_of_step
+            steps += (room - 0.025) / 0.12  # a step finer usually makes a file larger by 12 %
             if not fits < steps < exceeds:
                 steps = 0.5 * (fits + exceeds)
         return (best if fits > -math.inf else tried).to(scene.device)
@@ -254,7 +222,7 @@ def smallest_within(
     make: Callable[[int], Gaussians],
     views: Views,
     psnr: float,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> FoundQuality:
     """Search for the smallest scene of a method whose renders reach ``psnr``, dB, against those of the dense scene in
     some views; ``make(n)`` returns n Gaussians.
@@ -274,16 +242,14 @@ def smallest_within(
 
     def measure(count: int) -> float:
         nonlocal best
-        scene = make(count)
-        tried[count], worst = reference.psnr(scene)
+        scene, before = make(count), len(tried)
+        tried[count], worst = reference.psnr(scene, lambda share: progress(share_done(before + share)))
         if tried[count] >= psnr:
             best = FoundQuality(scene, count, tried[count], worst, tried)
-        if progress is not None:
-            progress(len(tried) / (len(tried) + 2))
         return tried[count]
 
-    first = max(1, round(BUDGETS.first_share * n))
-    find_count(measure, psnr, at_least=True, first=first, most=n, slope=BUDGETS.slope, settings=BUDGETS.psnr)
+    first = max(1, round(FIRST_SHARE * n))
+    find_count(measure, psnr, at_least=True, first=first, most=n, slope=SLOPE, tolerance=0.1)
     if best is None:
         raise BudgetError(f"all {n} Gaussians reach {tried[n]:.1f} dB, not {psnr:g} dB; ask for less")
     return best
@@ -304,7 +270,7 @@ def largest_within(
         make: ``make(n)`` returns n Gaussians, fewer than ``full`` has.
         limit: of the file, without rounding.
         progress: called with the share done.
-        psnr_of: gives the PSNR of a scene, dB; None where there are no views.
+        psnr_of: gives the PSNR of a scene, dB; None where there are no views: it is then taken to be 30 dB.
 
     Raises:
         BudgetError: if not even one Gaussian fits.
@@ -318,7 +284,7 @@ def largest_within(
         scene = full if count == n else make(count)
         written, found = _as_written(scene), limit
         if limit.kind.rounded is not None:
-            psnr = few_psnr(psnr_of(scene) if psnr_of else BUDGETS.unknown_psnr, count / n)
+            psnr = few_psnr(psnr_of(scene) if psnr_of else 30.0, count / n)
             rounding = rounding_for(psnr, full.sh_degree)
             written, found = limit.kind.rounded(written, rounding), replace(limit, rounding=rounding)
         tried[count] = limit.bytes_of(written)
@@ -326,11 +292,10 @@ def largest_within(
             best = FoundSize(scene, found, tried)
             if count == n and found.rounding and limit.bytes_of(full) <= limit.most:
                 best = FoundSize(full, limit, tried)
-        progress(len(tried) / (len(tried) + 2))
-        return math.log(tried[count])
+        progress(share_done(len(tried)))
+        return tried[count]
 
-    first = round(limit.most / BUDGETS.first_bytes)
-    find_count(measure, math.log(limit.most), at_least=False, first=first, most=n, slope=1.0, settings=BUDGETS.size)
+    find_size(measure, limit.most, round(limit.most / 15), n)  # few Gaussians take less than 15 bytes each
     if best is None:
         raise BudgetError(
             f"keep is {limit.most / 1e6:g}MB{limit.kind.suffix}, too small for one Gaussian; expected at least "
@@ -342,15 +307,16 @@ def largest_within(
 def few_psnr(psnr: float, kept: float) -> float:
     """PSNR by which the numbers of a scene are rounded that has a PSNR, dB, with a share ``kept`` of the Gaussians.
 
-    The squared error of merging is taken as A (kept^-p - 1): it falls by ``BUDGETS.slope`` for each e-fold of a small
+    The squared error of merging is taken as A (kept^-p - 1): it falls by ``SLOPE`` for each e-fold of a small
     count, and to 0 for all Gaussians. A Gaussian more gains the more, the nearer to all they are, so that rounding may
     cost more: at the best division of bytes, its error is a share of A kept^-p, which few Gaussians have.
     """
-    return psnr + 10 * math.log10(1 - kept ** (BUDGETS.slope * math.log(10) / 10)) if kept < 1 else psnr
+    return psnr + 10 * math.log10(1 - kept ** (SLOPE * math.log(10) / 10)) if kept < 1 else psnr
 
 
-def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = BUDGETS.sh_psnr) -> tuple[int, float]:
-    """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and the PSNR reached."""
+def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = 40.0) -> tuple[int, float]:
+    """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and the PSNR reached. An
+    independent error of 40 dB lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
     reference = DenseReference(dense, views)
     for degree in range(dense.sh_degree):
         overall, _ = reference.psnr(cut_sh(dense, degree))

@@ -31,6 +31,7 @@ from pointsplat_ns.pruning import (
     select,
 )
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
@@ -162,7 +163,9 @@ def _for_psnr(
 
     reached = smallest_within(dense, made, compared, budget.value, progress)
     note = (
-        f"{len(reached.tried)} sizes tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
+        f"{counted(len(reached.tried), 'size')} tried: no difference from the dense scene"
+        if reached.psnr == math.inf
+        else f"{counted(len(reached.tried), 'size')} tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
         f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
     )
     return whole.get(reached.count, reached.scene), limit, note
@@ -186,5 +189,5 @@ def _for_size(
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
-    note = f"{len(found.tried)} sizes tried for {bytes_text(limit.most)} as {limit.kind.name}"
+    note = f"{counted(len(found.tried), 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}"
     return found.scene, found.limit, note

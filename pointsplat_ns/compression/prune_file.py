@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pointsplat_ns.compression.posed_scene import PosesFile, without_poses
@@ -130,7 +131,8 @@ def prune_file(
             "`pointsplat convert` changes"
         )
     if request.sh.isdigit():
-        rows = replace(rows, rest=min(rows.rest, (int(request.sh) + 1) ** 2 - 1))
+        rows = copy.copy(rows)
+        rows.rest = min(rows.rest, (int(request.sh) + 1) ** 2 - 1)
     most = _most_in_cell(rows, memory)
     given = None if poses is None or without_poses(poses) else poses
     file = None if given is None else PosesFile.of(rows.path, given).relative_to(rows.traits.offset)

@@ -68,9 +68,7 @@ def quality_if_seen(dense: Gaussians, scene: Gaussians, views: Callable[[], View
         return None
 
 
-def quality_of_pruned(dense: Gaussians, pruned: Pruned, source: ViewSource) -> FullSizeQuality | None:
+def quality_of_pruned(dense: Gaussians, scene: Gaussians, pruned: Pruned, source: ViewSource) -> FullSizeQuality | None:
     """:func:`quality_of` in known views, else in those that merging rendered; None if there is no place to look
     from."""
-    return quality_if_seen(
-        dense, pruned.scene, lambda: source.known(VIEW_COUNTS.weighed) or pruned.views or source.whole()
-    )
+    return quality_if_seen(dense, scene, lambda: source.known(VIEW_COUNTS.weighed) or pruned.views or source.whole())

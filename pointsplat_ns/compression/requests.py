@@ -108,7 +108,7 @@ class PruneRequest:
     """One of :data:`~pointsplat_ns.pruning.METHODS`."""
     sh: str = "all"
     """"all" keeps the SH bands, a digit cuts them to that degree, "auto" cuts them to the lowest degree whose renders
-    reach 40 dB against those with all bands (:class:`~pointsplat_ns.compression.budget_search.BudgetSettings`)."""
+    reach 40 dB against those with all bands."""
     opacity_weight: float | None = None
     """Lambda of the methods that weigh opacity; None is the paper's value."""
     clean: bool = False

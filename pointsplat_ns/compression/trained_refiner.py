@@ -18,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import find_runs_and_plys, shown_scene
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.runs import METHOD_NAMES, Run, open_run
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import SHIPPED_REFINER

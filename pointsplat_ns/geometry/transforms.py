@@ -62,6 +62,21 @@ SHORTEST = torch.finfo(torch.float32).tiny
 precision: float32 has no inverse of its length, so its direction would depend on the precision."""
 
 
+def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
+
+    A zero vector, or one shorter than :data:`SHORTEST`, becomes zero, and so does
+    its inverse length: it has no gradient. The length is taken after division by the largest component, so that neither
+    1e-30 nor 1e30 under- or overflows.
+    """
+    largest = vectors.abs().amax(dim=0)
+    zero = largest < SHORTEST
+    inverse = largest.masked_fill(zero, torch.inf).reciprocal_()
+    scaled = vectors * inverse
+    length = (scaled * scaled).sum(dim=0).masked_fill_(zero, 1.0).rsqrt_()
+    return scaled.mul_(length), inverse.mul_(length)
+
+
 def rotation_components(unit: Tensor) -> Tensor:
     """Rotation matrices (3, 3, M) of unit quaternions (4, M), each entry contiguous; zero gives the identity."""
     w, x, y, z = unit

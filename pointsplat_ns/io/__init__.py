@@ -9,9 +9,8 @@ from pointsplat_ns.io.files import content_hash
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.io.ply_writing import write_ply
 from pointsplat_ns.io.runs import Run, open_run, scene_name
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
 from pointsplat_ns.io.scene import read_scene, save
-from pointsplat_ns.io.splatfacto import read_checkpoint
+from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints, read_checkpoint
 
 __all__ = [
     "Run",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -68,12 +69,8 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
             logger.warning("passed over %s: a result of %s", path, *sources)
             files.remove(path)
     named = [(_stem(path.relative_to(folder)), path) for path in files]
-    if _run_folders(folder):
-        try:
-            runs = find_runs(folder, need_data=False)
-        except SceneError:
-            runs = []  # those passed over have been named
-        named += [(_name_below(folder, run), run.folder) for run in runs]
+    with suppress(SceneError):  # no run; those passed over have been named
+        named += [(_name_below(folder, run), run.folder) for run in find_runs(folder, need_data=False)]
     if not named:
         raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
     shared = {name for name, count in Counter(name for name, _ in named).items() if count > 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
 import json
@@ -12,7 +13,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -21,7 +22,6 @@ from typing import Any, BinaryIO
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import Gaussians
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -302,6 +302,25 @@ def _without_infinities(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+_FORMULA = tuple("=+-@\t\r\n\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SIGN}\N{FULLWIDTH HYPHEN-MINUS}") + (
+    "\N{FULLWIDTH COMMERCIAL AT}",
+)
+"""Signs by which spreadsheets tell a formula, which may send what stands in other cells (OWASP, CSV injection)."""
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person named.
+
+    A text that a spreadsheet would take for a formula gets a leading apostrophe, as a file's name may be a stranger's.
+    """
+    with replacing(path, named=False) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            texts = {name for name, value in row.items() if isinstance(value, str) and value.startswith(_FORMULA)}
+            writer.writerow({name: f"'{value}" if name in texts else value for name, value in row.items()})
+
+
 def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[str, str]) -> None:
     """Write tensors of any device and a header of metadata to a safetensors file, as :func:`replacing` does."""
     from safetensors import SafetensorError
@@ -313,42 +332,3 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: dict[
             save_file(contiguous, part, metadata=header)
         except SafetensorError as error:  # for one, of a full disk
             raise OSError(one_line(error)) from error
-
-
-_everything: ContextVar[bool] = ContextVar("everything", default=False)
-
-
-@contextmanager
-def unusable_kept() -> Iterator[None]:
-    """Let readers keep Gaussians that cannot be drawn, for those who count them."""
-    token = _everything.set(True)
-    try:
-        yield
-    finally:
-        _everything.reset(token)
-
-
-def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
-    """``scene`` without infinite values, and without the Gaussians that cannot be drawn, whose number is logged.
-
-    Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
-    :meth:`~pointsplat_ns.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the same in float32.
-    """
-    if _everything.get():
-        return scene
-    usable = usable_part(scene)
-    dropped = len(scene) - len(usable)
-    if dropped:
-        logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", path, dropped, len(scene))
-    return usable
-
-
-def usable_part(scene: Gaussians) -> Gaussians:
-    """As :func:`keep_usable`, always, and without a warning."""
-    usable = scene.usable()
-    if not bool(usable.all()):
-        scene = scene[usable]
-    if bool(scene.opacities.isinf().any()) or bool(scene.scales.isinf().any()):
-        opacities = scene.opacities.nan_to_num(posinf=30.0, neginf=-30.0)
-        scene = scene.replace(opacities=opacities, scales=scene.scales.nan_to_num(neginf=-87.0))
-    return scene

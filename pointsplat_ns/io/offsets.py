@@ -9,18 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pointsplat_ns.gaussians import Gaussians, Offset, Traits
+from pointsplat_ns.gaussians import Gaussians, Offset
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.system.tensors import DOUBLES
 
 SAMPLED = 4096
 """Gaussians that tell the distance and the size of a scene, at most."""
-
-_LARGEST = 1e15
-"""Coordinate of an offset, scene units; beyond it, doubles have steps of a tenth."""
-
-_FINE, _COARSE = 1 / 32, 1 / 4
-"""Steps of float32, in median sizes of Gaussians: from where on doubles get an offset, and float32 is warned of."""
 
 
 def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> Offset | None:
@@ -33,7 +27,7 @@ def offset_for(means: NDArray[np.float64], log_scales: NDArray[np.floating]) -> 
         log_scales: (N, 2) or (N, 3) natural logarithms of standard deviations in scene units.
     """
     usable = np.isfinite(means).all(axis=1) & np.isfinite(log_scales).all(axis=1)
-    if not usable.any() or _steps_a_size(means[usable], log_scales[usable]) <= _FINE:
+    if not usable.any() or _steps_a_size(means[usable], log_scales[usable]) <= 1 / 32:
         return None
     return rounded_centre(means[usable])
 
@@ -47,35 +41,6 @@ def rounded_centre(means: NDArray[np.float64]) -> Offset:
     return x, y, z
 
 
-def has_doubles(rows: np.dtype) -> bool:
-    """Whether rows of a PLY have x, y or z as doubles."""
-    return any(name in (rows.names or ()) and rows[name].newbyteorder("=") == np.float64 for name in "xyz")
-
-
-def positions_of(rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """The positions (N, 3) in rows of a PLY, float64."""
-    return np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
-
-
-def shift_of(rows: NDArray[np.void]) -> Offset | None:
-    """What is subtracted from the positions of a 3DGS PLY before they become float32, by some of its rows (N,); None
-    if they have no doubles, or need none."""
-    if not has_doubles(rows.dtype):
-        return None
-    names = [name for name in ("scale_0", "scale_1", "scale_2") if name in (rows.dtype.names or ())]
-    return offset_for(positions_of(rows), np.stack([rows[name].astype(np.float64) for name in names], axis=1))
-
-
-def with_shift(traits: Traits, shift: Offset | None, path: Path | None) -> Traits:
-    """The traits of a scene from whose positions ``shift`` is subtracted, which is logged if there is a ``path``."""
-    if shift is None:
-        return traits
-    x, y, z = (a + b for a, b in zip(traits.offset or (0.0, 0.0, 0.0), shift, strict=True))
-    if path is not None:
-        logger.info("%s: positions are doubles; their offset %s is kept beside the scene", path, offset_text((x, y, z)))
-    return traits._replace(offset=(x, y, z))
-
-
 def warn_if_far(scene: Gaussians, path: Path | str) -> None:
     """Log that a scene's positions have lost digits, if steps of float32 are large beside the sizes of Gaussians."""
     some = scene[:: max(1, len(scene) // SAMPLED)]
@@ -83,7 +48,7 @@ def warn_if_far(scene: Gaussians, path: Path | str) -> None:
         return
     means = some.means.detach().double().cpu().numpy()
     times = _steps_a_size(means, some.scales.detach().double().cpu().numpy())
-    if times > _COARSE:
+    if times > 1 / 4:
         logger.warning(
             "%s: lies %.3g units from its origin, where float32 has steps of %.2g times the median size of a Gaussian: "
             "positions have lost their digits; export it with x, y and z as doubles, or nearer to the origin",
@@ -102,7 +67,8 @@ def offset_of_text(text: str) -> Offset | None:
         x, y, z = (float(word) for word in text.split())
     except ValueError:
         return None
-    return (x, y, z) if all(abs(value) < _LARGEST for value in (x, y, z)) else None
+    # Beyond 1e15, doubles have steps of a tenth.
+    return (x, y, z) if all(abs(value) < 1e15 for value in (x, y, z)) else None
 
 
 def from_centre(scene: Gaussians) -> Gaussians:

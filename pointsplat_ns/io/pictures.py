@@ -10,11 +10,6 @@ from torch import Tensor
 
 from pointsplat_ns.io.files import replacing
 
-_ORIENTATION = 274
-"""EXIF's tag of how a photo is to be turned."""
-_TURNED = (5, 6, 7, 8)
-"""Its values that exchange width and height."""
-
 
 def in_unit_range(image: Tensor) -> Tensor:
     """An image of any shape in [0, 1]: bytes count in 255ths, floats stay."""
@@ -29,11 +24,11 @@ def exif_hint(path: Path, wanted: tuple[int, int]) -> str:
 
     try:
         with Image.open(path) as photo:
-            size, orientation = photo.size, photo.getexif().get(_ORIENTATION)
+            size, orientation = photo.size, photo.getexif().get(274)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return ""
     upright = (size[0] - size[1]) * (wanted[0] - wanted[1]) > 0  # or scaled
-    if orientation not in _TURNED or upright:
+    if orientation not in (5, 6, 7, 8) or upright:  # those exchange width and height
         return ""
     return (
         f"; its EXIF orientation ({orientation}) says that it is to be turned, and the camera is that of the turned "

@@ -11,7 +11,6 @@ import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,8 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset, Traits, sh_degree_of
-from pointsplat_ns.io.files import keep_usable, logger, one_line, require_file, require_memory
-from pointsplat_ns.io.offsets import SAMPLED, has_doubles, positions_of, shift_of, with_shift
+from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
+from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
 from pointsplat_ns.io.ply_dialects import (
     COLORS,
     COLUMNS,
@@ -33,6 +32,7 @@ from pointsplat_ns.io.ply_dialects import (
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
+from pointsplat_ns.io.usable import keep_usable
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -51,33 +51,21 @@ def read_ply(path: Path | str) -> Gaussians:
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
     """
-    from plyfile import PlyData, PlyParseError
-
-    path = require_file(path, "a 3DGS PLY file")
-    try:
-        header, vertex, in_file = _checked(path)
-        k = min(in_file, MAX_REST)
-        require_memory(path, vertex.count * 4 * (14 + 3 * k))  # float32 numbers
-        _report_unread(header, vertex, in_file, path)
-        if header.order:
-            scene = PlyRows.of(path, header, vertex, in_file).read(0, vertex.count)
-        else:
-            with _GaussiansAlone(path, header) as stream:
-                rows = PlyData.read(stream)["vertex"].data
-            shift = shift_of(rows[:: max(1, len(rows) // SAMPLED)])
-            traits = with_shift(_traits(header, vertex, path), shift, path)
-            scene = _scene(len(rows), lambda these: rows[these], k, in_file, traits, shift)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
-    except (PlyParseError, ValueError, OverflowError) as error:
-        wanted = f"{vertex.count} Gaussians of {len(vertex.properties)} numbers"
-        raise SceneError(f"{path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
-    return keep_usable(scene, path)
+    rows = PlyRows(path, whole=True)
+    return keep_usable(rows.read(0, len(rows)), path)
 
 
-@dataclass(frozen=True)
 class PlyRows:
-    """The Gaussians of a binary 3DGS PLY, read from the file in pieces: the whole need not fit into memory."""
+    """The Gaussians of a 3DGS PLY; of a binary one, they are read in pieces, and the whole need not fit into memory.
+
+    Args:
+        path: the file.
+        warn: whether what is not read, and the offset of positions, are logged.
+        whole: whether all rows will be read at once.
+
+    Raises:
+        SceneError: if the file is not a PLY, is truncated, or lacks a property.
+    """
 
     path: Path
     count: int
@@ -86,39 +74,33 @@ class PlyRows:
     """Number of SH coefficients per channel beyond the constant one that are read."""
     traits: Traits
     """What the file declares beside the Gaussians."""
-    _dtype: np.dtype
-    """Properties of a row."""
-    _start: int
-    """Where the first row begins, bytes."""
-    _in_file: int
-    """Number of SH coefficients per channel beyond the constant one in the file."""
-    _shift: Offset | None = None
-    """What is subtracted from positions."""
+
+    def __init__(self, path: Path | str, warn: bool = True, whole: bool = False):
+        self.path = path = require_file(path, "a 3DGS PLY file")
+        with _opened(path) as stream:
+            header = with_plain_names(read_header(stream, path))
+        vertex = _gaussian_element(header, path)
+        self.count, self._in_file = vertex.count, _num_rest(vertex, path)
+        self.rest = min(self._in_file, MAX_REST)
+        if whole:
+            require_memory(path, vertex.count * 4 * (14 + 3 * self.rest))  # float32 numbers
+        if warn:
+            _report_unread(header, vertex, self._in_file, path)
+        self._dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
+        self._start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
+        self._parsed = None if header.order else _parsed(path, header, vertex)
+        traits = traits_of(header, path)  # who trained with Mip-Splatting's 3D filter trained with antialiasing
+        self.traits = traits._replace(antialiased=traits.antialiased or FILTER in self._names)
+        self._shift: Offset | None = None
+        if vertex.count and any(self._dtype[name].newbyteorder("=") == np.float64 for name in "xyz"):
+            self._shift_positions(warn)
 
     @classmethod
     def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
-        """The rows of a file, its header checked as by :func:`read_ply`, which may ``warn``; None for an ASCII file,
-        which has no rows of one length. Raises SceneError as :func:`read_ply` does."""
+        """The rows of a file, which may ``warn``; None for an ASCII file, which has no rows of one length."""
         path = require_file(path, "a 3DGS PLY file")
-        header, vertex, in_file = _checked(path)
-        if not header.order:
-            return None
-        if warn:
-            _report_unread(header, vertex, in_file, path)
-        return cls.of(path, header, vertex, in_file, warn)
-
-    @classmethod
-    def of(cls, path: Path, header: Header, vertex: Element, in_file: int, warn: bool = True) -> PlyRows:
-        """The rows of a file with what :func:`_checked` found in it; an offset is logged if ``warn``."""
-        dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
-        start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        rows = cls(path, vertex.count, min(in_file, MAX_REST), _traits(header, vertex, path), dtype, start, in_file)
-        if vertex.count and has_doubles(dtype):
-            with rows._opened() as stream:
-                some = range(0, vertex.count, max(1, vertex.count // SAMPLED))
-                shift = shift_of(rows._table(b"".join(rows._row(number, stream) for number in some), len(some)))
-            rows = replace(rows, traits=with_shift(rows.traits, shift, path if warn else None), _shift=shift)
-        return rows
+        with _opened(path) as stream:
+            return cls(path, warn) if read_header(stream, path).order else None
 
     def __len__(self) -> int:
         return self.count
@@ -131,65 +113,98 @@ class PlyRows:
     def read(self, start: int, stop: int) -> Gaussians:
         """The Gaussians of rows ``start`` to ``stop`` - 1, float32, those that cannot be drawn included. Raises
         SceneError if the file cannot be read or has become shorter."""
-        size = self._dtype.itemsize
-        with self._opened() as stream:
-            stream.seek(self._start + start * size)
-            return self._scene(stop - start, lambda these: stream.read((these.stop - these.start) * size))
+        with _opened(self.path) as stream:
+            return self._scene(stop - start, lambda these: self._rows(stream, [range(start, stop)[these]]))
 
     def pick(self, rows: Sequence[int]) -> Gaussians:
         """The Gaussians of single rows, as :meth:`read` gives them."""
-        with self._opened() as stream:
-            return self._scene(len(rows), lambda these: b"".join(self._row(number, stream) for number in rows[these]))
+        with _opened(self.path) as stream:
+            return self._scene(len(rows), lambda these: self._rows(stream, [range(n, n + 1) for n in rows[these]]))
 
-    def _row(self, number: int, stream: io.BufferedReader) -> bytes:
-        stream.seek(self._start + number * self._dtype.itemsize)
-        return stream.read(self._dtype.itemsize)
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return self._dtype.names or ()
 
-    def _table(self, data: bytes, count: int) -> np.ndarray:
-        """The rows (count,) in bytes of the file. Raises SceneError if it has become shorter."""
-        if len(data) < self._dtype.itemsize * count:
+    def _rows(self, stream: io.BufferedReader, ranges: Sequence[range]) -> np.ndarray:
+        """Rows in ranges, one after the other. Raises SceneError if the file has become shorter."""
+        if self._parsed is not None:
+            return np.concatenate([self._parsed[part.start : part.stop] for part in ranges])
+        size, pieces = self._dtype.itemsize, []
+        for part in ranges:
+            stream.seek(self._start + part.start * size)
+            pieces.append(stream.read(len(part) * size))
+        if sum(map(len, pieces)) < size * sum(map(len, ranges)):
             raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
-        return np.frombuffer(data, self._dtype)
+        return np.frombuffer(b"".join(pieces), self._dtype)
 
-    @contextmanager
-    def _opened(self) -> Iterator[io.BufferedReader]:
-        """The file, open. Raises SceneError if it cannot be read."""
-        try:
-            with self.path.open("rb") as stream:
-                yield stream
-        except OSError as error:
-            raise SceneError(f"{self.path}: cannot be read ({error.strerror or one_line(error)})") from error
+    def _shift_positions(self, warn: bool) -> None:
+        """Subtract an offset from positions that float32 would round too far, which is logged if ``warn``."""
+        with _opened(self.path) as stream:
+            some = range(0, self.count, max(1, self.count // SAMPLED))
+            rows = self._rows(stream, [range(number, number + 1) for number in some])
+        scales = [name for name in COLUMNS["scales"] if name in self._names]
+        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, scales))
+        if self._shift is not None:
+            x, y, z = (a + b for a, b in zip(self.traits.offset or (0.0, 0.0, 0.0), self._shift, strict=True))
+            self.traits = self.traits._replace(offset=(x, y, z))
+            if warn:
+                text = offset_text((x, y, z))
+                logger.info("%s: positions are doubles; their offset %s is kept beside the scene", self.path, text)
 
-    def _scene(self, count: int, bytes_of: Callable[[slice], bytes]) -> Gaussians:
-        """The Gaussians of ``count`` rows, of which ``bytes_of`` gives those of a slice."""
+    def _scene(self, count: int, rows_of: Callable[[slice], np.ndarray]) -> Gaussians:
+        """The Gaussians in ``count`` rows, of which ``rows_of`` gives those of a slice."""
+        from numpy.lib.recfunctions import structured_to_unstructured
 
-        def rows_of(these: slice) -> np.ndarray:
-            return self._table(bytes_of(these), these.stop - these.start)
+        # Channel-major in the file, channel last in a scene.
+        rest = [f"f_rest_{channel * self._in_file + i}" for i in range(self.rest) for channel in range(3)]
+        columns = columns_of(self._names) | {"features_rest": rest}
+        tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
+        at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
+        # A double beyond float32 becomes Inf and is dropped with the others.
+        with np.errstate(over="ignore"):
+            for start in range(0, count, at_once):
+                chunk = slice(start, min(start + at_once, count))
+                rows = rows_of(chunk)
+                if self._shift is not None:
+                    tables["means"][chunk] = _doubles(rows, COLUMNS["means"]) - self._shift
+                for name, fields in columns.items():
+                    if fields and not (name == "means" and self._shift is not None):
+                        tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
+        tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, self._dtype).items()}
+        tensors["features_rest"] = tensors["features_rest"].reshape(count, self.rest, 3)
+        antialiased, up, offset = self.traits
+        return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
 
-        return _scene(count, rows_of, self.rest, self._in_file, self.traits, self._shift)
 
-
-def _checked(path: Path) -> tuple[Header, Element, int]:
-    """The header of a file, the element that holds the Gaussians, and :func:`_num_rest` of it. Raises SceneError if it
-    is not a 3DGS PLY, or cannot be read."""
+@contextmanager
+def _opened(path: Path) -> Iterator[io.BufferedReader]:
+    """The file, open. Raises SceneError if it cannot be read."""
     try:
         with path.open("rb") as stream:
-            header = with_plain_names(read_header(stream, path))
+            yield stream
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
-    vertex = _gaussian_element(header, path)
-    return header, vertex, _num_rest(vertex, path)
 
 
-def _traits(header: Header, vertex: Element, path: Path) -> Traits:
-    """The traits of a scene; one with Mip-Splatting's 3D filter was trained with antialiasing."""
-    traits = traits_of(header, path)
-    return traits._replace(antialiased=traits.antialiased or FILTER in {name for name, _ in vertex.properties})
+def _doubles(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
+
+
+def _parsed(path: Path, header: Header, vertex: Element) -> np.ndarray:
+    """The rows of an ASCII file. plyfile gets a checked header that ends with the Gaussians, so comments in other
+    encodings and elements after the Gaussians cannot cause errors. Raises SceneError if they are damaged."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        with _GaussiansAlone(path, header) as stream:
+            return PlyData.read(stream)["vertex"].data
+    except (PlyParseError, ValueError, OverflowError) as error:
+        wanted = f"{vertex.count} Gaussians of {len(vertex.properties)} numbers"
+        raise SceneError(f"{path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
 
 
 class _GaussiansAlone(io.FileIO):
-    """A PLY file as plyfile reads it, with its header replaced by a checked one that ends with the Gaussians. So
-    comments in other encodings and elements after the Gaussians cannot cause errors."""
+    """A PLY file whose header is another."""
 
     def __init__(self, path: Path, header: Header):
         super().__init__(path)
@@ -276,36 +291,3 @@ def _num_rest(vertex: Element, path: Path) -> int:
             "(SH degree 0 to 4)"
         )
     return len(rest) // 3
-
-
-def _scene(
-    count: int,
-    rows_of: Callable[[slice], np.ndarray],
-    k: int,
-    in_file: int,
-    traits: Traits,
-    shift: Offset | None,
-) -> Gaussians:
-    """The scene in ``count`` structured rows, of which ``rows_of`` gives those of a slice, with ``k`` coefficients per
-    channel beyond the constant one, of ``in_file`` that the file has. ``shift`` is subtracted from positions."""
-    from numpy.lib.recfunctions import structured_to_unstructured
-
-    kinds = rows_of(slice(0, 0)).dtype
-    # Channel-major in the file, channel last in a scene.
-    rest = [f"f_rest_{channel * in_file + i}" for i in range(k) for channel in range(3)]
-    columns = columns_of(kinds.names or ()) | {"features_rest": rest}
-    tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
-    at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
-    # A double beyond float32 becomes Inf and is dropped with the others.
-    with np.errstate(over="ignore"):
-        for start in range(0, count, at_once):
-            chunk = slice(start, min(start + at_once, count))
-            rows = rows_of(chunk)
-            if shift is not None:
-                tables["means"][chunk] = positions_of(rows) - shift
-            for name, fields in columns.items():
-                if fields and not (name == "means" and shift is not None):
-                    tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
-    tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, kinds).items()}
-    tensors["features_rest"] = tensors["features_rest"].reshape(count, k, 3)
-    return Gaussians(**tensors, antialiased=traits.antialiased, up=traits.up, offset=traits.offset)

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
-from pointsplat_ns.io.files import keep_usable, replacing
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply_dialects import COLUMNS
 from pointsplat_ns.io.ply_header import first_lines
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.pieces import CHUNK
 
 

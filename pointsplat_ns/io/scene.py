@@ -1,20 +1,32 @@
-"""Reads and writes scenes of all supported formats."""
+"""Reads, writes and identifies scenes of all supported formats."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import hashlib
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import keep_usable, logger, require_file
-from pointsplat_ns.io.formats import READABLE, Format, format_named, format_to_read, format_to_write
+from pointsplat_ns.io.files import content_hash, logger, never_replaced, one_line, require_file
+from pointsplat_ns.io.formats import (
+    READABLE,
+    SOG_META,
+    STREAM_META,
+    Format,
+    format_named,
+    format_to_read,
+    format_to_write,
+)
 from pointsplat_ns.io.formats.holding import losses
+from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.offsets import warn_if_far
-from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
-from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
+from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
+from pointsplat_ns.io.splatfacto import checkpoint_parts, open_checkpoint, read_checkpoint
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (
@@ -63,31 +75,39 @@ def read_scene(path: Path | str) -> Gaussians:
         2
     """
     path = Path(path)
-    if path.is_dir() and (path / RUN_FILES.config).is_file():
-        return _scene_of(open_run(path, need_data=False))
+    found = _found(path)
+    run = found if isinstance(found, Run) else _run_around(path, found)
+    if isinstance(found, Run):
+        scene = read_checkpoint(found.checkpoint)
+    else:
+        assert found.read is not None
+        scene = found.read(path)
+        warn_if_far(scene, path)
+    return scene if run is None else scene.replace(antialiased=run.rasterize_mode == "antialiased")
+
+
+def _found(path: Path) -> Format | Run:
+    """The format of a file or a SOG folder, or the run at a path. Raises SceneError as :func:`read_scene`."""
+    run = path.is_dir() and (path / RUN_FILES.config).is_file()
     if not path.is_dir():
         require_file(path, SCENE_KINDS)
-    kind = format_to_read(path)
-    if kind is None and path.suffix.lower() in RUN_FILES.configs:
-        return _scene_of(open_run(path, need_data=False))
-    if kind is None or kind.read is None:
-        what = (
-            f"a folder without {RUN_FILES.config} or meta.json"
-            if path.is_dir()
-            else f"a {path.suffix or 'nameless'} file"
-        )
-        raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
-    scene = kind.read(path)
-    warn_if_far(scene, path)
+    kind = None if run else format_to_read(path)
+    if kind is not None:
+        return kind
+    if run or path.suffix.lower() in RUN_FILES.configs:
+        return open_run(path, need_data=False)
+    what = (
+        f"a folder without {RUN_FILES.config} or {SOG_META}" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
+    )
+    raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
+
+
+def _run_around(path: Path, kind: Format) -> Run | None:
+    """The run of a checkpoint; None if it lies outside of one, or the file is of another format."""
     if kind.read is read_checkpoint:
-        with suppress(SceneError):  # a checkpoint outside a run
-            return scene.replace(antialiased=open_run(path, need_data=False).rasterize_mode == "antialiased")
-    return scene
-
-
-def _scene_of(run: Run) -> Gaussians:
-    """The scene of a run's checkpoint, antialiased if the run was trained so."""
-    return read_checkpoint(run.checkpoint).replace(antialiased=run.rasterize_mode == "antialiased")
+        with suppress(SceneError):
+            return open_run(path, need_data=False)
+    return None
 
 
 def kind_of(path: Path | str) -> str:
@@ -101,36 +121,34 @@ def kind_of(path: Path | str) -> str:
         '3DGS PLY'
     """
     path = Path(path)
-    in_run = path.is_dir() and (path / RUN_FILES.config).is_file()
-    kind = None if in_run else format_to_read(path)
-    if kind is None:
-        run = open_run(path, need_data=False)
-        return f"run of {run.method_name or 'an unknown method'}, step {run.step}"
-    if kind.read is not read_checkpoint:
-        return kind.name
-    with suppress(SceneError):  # a checkpoint outside a run
-        run = open_run(path, need_data=False)
-        return f"checkpoint of {run.method_name or 'an unknown method'}, step {run.step}"
-    found = open_checkpoint(path)
-    return f"checkpoint of {found.program}" + ("" if found.step is None else f", step {found.step}")
+    found = _found(path)
+    run = found if isinstance(found, Run) else _run_around(path, found)
+    if run is not None:
+        what = "run" if found is run else "checkpoint"
+        return f"{what} of {run.method_name or 'an unknown method'}, step {run.step}"
+    if isinstance(found, Format) and found.read is not read_checkpoint:
+        return found.name
+    opened = open_checkpoint(path)
+    return f"checkpoint of {opened.program}" + ("" if opened.step is None else f", step {opened.step}")
 
 
-def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) -> None:
+def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:
     """Write a scene in the format that the path's name asks for.
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
     ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
     glTF, exact to rounding. Gaussians that cannot be drawn (NaN, or Inf where it is not
-    valid) are left out, and their number is logged. The write is atomic and replaces an existing file.
+    valid) are left out, and their number is logged. The file appears whole or not at all.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,
             with K = (d+1)^2 - 1 and 12 bytes of unused normals.
         path: a path that ends in one of these. Missing folders are created.
         progress: True shows a bar; a function is called with what is being done and the share done of it.
+        overwrite: whether an existing file is replaced.
 
     Raises:
-        SceneError: if the path has another suffix, is a folder, or cannot be written.
+        SceneError: if the path has another suffix, is a folder, cannot be written, or exists and is not to be replaced.
 
     Example:
         >>> import tempfile
@@ -141,8 +159,11 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False) 
         100
     """
     path = Path(path)
-    with progress_bar(progress) as report:
-        save_as(format_to_write(path), scene, path, report)
+    kind = format_to_write(path)
+    if path.is_file() and not overwrite:
+        raise SceneError(f"{path}: exists already; name another file, or replace it with overwrite=True")
+    with progress_bar(progress) as report, nullcontext() if overwrite else never_replaced(path):
+        save_as(kind, scene, path, report)
 
 
 def save_as(
@@ -163,3 +184,56 @@ def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
         others = (format_named(suffix) for suffix in (".sog", ".glb", ".ply"))
         keeper = next(other.suffix for other in others if other is not None and not losses(scene, other.capacity))
         logger.warning("%s: lost in %s: %s; %s keeps it", name, kind.name, "; ".join(found), keeper)
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """The file that a dense scene was read from. Of a SOG folder, streamed or not, and of a checkpoint in parts,
+    ``name`` is that of the folder, ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of
+    each, by its path in the folder."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+def source_file(path: Path | str) -> SourceFile:
+    """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. Raises
+    SceneError if there is none, or it cannot be read."""
+    parts = source_parts(path)
+    if len(parts) > 1 or parts[0].name == SOG_META:
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        hashes = "".join(f"{part.relative_to(folder).as_posix()} {content_hash(part)}\n" for part in parts)
+        total = sum(part.stat().st_size for part in parts)
+        return SourceFile(folder.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
+    digest = content_hash(parts[0])
+    return SourceFile(parts[0].name, parts[0].stat().st_size, digest)
+
+
+def source_parts(path: Path | str) -> list[Path]:
+    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, all
+    parts of a checkpoint, or one. Raises SceneError if a run has none, or a folder cannot be read."""
+    path = Path(path)
+    parts = _sog_parts(path)
+    if parts:
+        return parts
+    if may_be_run(path) and not (path.is_file() and format_to_read(path)):
+        return [open_run(path, need_data=False).checkpoint]
+    return checkpoint_parts(path)
+
+
+def _sog_parts(path: Path) -> list[Path]:
+    """The files of a SOG folder, streamed or not, by name: its JSON and its images; none if the path is no such
+    folder."""
+    folder = path.parent if path.name in (SOG_META, STREAM_META) else path
+    streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
+    if not (streamed or (folder / SOG_META).is_file()) or (folder / RUN_FILES.config).is_file():
+        return []
+    try:
+        if streamed:
+            names = sorted(stream_parts(folder / STREAM_META))
+        else:
+            names = sorted(part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
+        return [part for part in names if part.is_file()]
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error

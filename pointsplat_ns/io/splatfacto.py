@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import zipfile
 from collections.abc import Iterable
@@ -10,14 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, logger, one_line, read_text, require_file, require_memory
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.io.files import logger, one_line, read_text, require_file, require_memory
+from pointsplat_ns.io.usable import keep_usable
 
 EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"
 
@@ -236,6 +238,21 @@ def is_complete(path: Path) -> bool:
         return path.is_file() and zipfile.is_zipfile(path)
     except (OSError, zipfile.BadZipFile):  # of an archive in several parts
         return False
+
+
+def allow_splatfacto_checkpoints() -> None:
+    """Register numpy's float64 and float32 scalars with torch's ``weights_only`` loader, if they are not.
+
+    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers, and one of 3D Gaussian Splatting in
+    its optimiser. The functions registered here rebuild it from its bytes; they cannot run code from the file.
+    """
+    # numpy 2 renamed the module.
+    scalar = importlib.import_module(f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray").scalar
+    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    # A checkpoint may come from the other major version of numpy, so register the function under both names.
+    allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    present = torch.serialization.get_safe_globals()
+    torch.serialization.add_safe_globals([entry for entry in allowed if entry not in present])
 
 
 def _load(path: Path) -> Any:

@@ -23,8 +23,8 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
-from pointsplat_ns.io.files import keep_usable
-from pointsplat_ns.io.source import SourceFile
+from pointsplat_ns.io.scene import SourceFile
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import (
     Displacement,
     RenderErrors,

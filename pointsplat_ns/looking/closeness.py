@@ -74,9 +74,15 @@ class Reference:
         """Mean squared error over all pixels of each view."""
         return list(self._errors(_drawn(scene, self.views)))
 
-    def psnr(self, scene: Gaussians) -> tuple[float, float]:
-        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`."""
-        close = Closeness(tuple(self.errors(scene)), self.covered)
+    def psnr(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> tuple[float, float]:
+        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`. ``progress`` is called with the share
+        of the views done."""
+        errors: list[float] = []
+        for error in self._errors(_drawn(scene, self.views)):
+            errors.append(error)
+            if progress is not None:
+                progress(len(errors) / len(self.renders))
+        close = Closeness(tuple(errors), self.covered)
         return close.psnr, close.worst
 
     def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:

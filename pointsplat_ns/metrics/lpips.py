@@ -10,10 +10,9 @@ from __future__ import annotations
 import os
 import socket
 import threading
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from cachetools import LRUCache, TTLCache
@@ -32,25 +31,24 @@ class LpipsUnavailable(PointSplatError):
     """The weights of LPIPS, or torchvision, are not available; the message says why, in one line."""
 
 
-@dataclass(frozen=True)
-class _Backbone:
+class _Backbone(NamedTuple):
     """A torchvision network that LPIPS uses."""
 
     minimum: int  # image side below which its last layer is empty
-    files: tuple[str, ...]  # usual file names; the last is torchvision's own
+    files: tuple[str, str]  # usual file names; the second is torchvision's own
     digest: str  # SHA-256 of torchvision's file, of which its name has the first 8 digits
 
 
-_BACKBONES: dict[str, _Backbone] = {
+_BACKBONES = {
     "alex": _Backbone(
-        minimum=31,
-        files=("alexnet_features.pth", "alexnet-owt-7be5be79.pth"),
-        digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+        31,
+        ("alexnet_features.pth", "alexnet-owt-7be5be79.pth"),
+        "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
     ),
     "vgg": _Backbone(
-        minimum=16,
-        files=("vgg16_features.pth", "vgg16-397923af.pth"),
-        digest="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+        16,
+        ("vgg16_features.pth", "vgg16-397923af.pth"),
+        "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
     ),
 }
 
@@ -66,29 +64,21 @@ class Lpips(nn.Module):
 
     def __init__(self, net: Net, backbone: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self.net = net
-        self.network = empty_network(net)
-        weights = {  # net.slice2.5.weight is torchvision's features.5.weight
-            name: _expect(backbone, f"features.{name.split('.', 2)[2]}", tuple(empty.shape))
-            for name, empty in self.network.state_dict().items()
-            if name.startswith("net.")
-        }
-        self.network.load_state_dict({**weights, **linear}, strict=False, assign=True)
+        self.net, self.network = net, empty_network(net)
+        weights = {**linear}
+        for name, empty in self.network.state_dict().items():
+            if name.startswith("net."):  # net.slice2.5.weight is torchvision's features.5.weight
+                key, shape = f"features.{name.split('.', 2)[2]}", tuple(empty.shape)
+                value = backbone.get(key)
+                if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+                    found = tuple(value.shape) if isinstance(value, Tensor) else [*backbone][:3]
+                    raise LpipsUnavailable(f"expected {key!r} of shape {shape}; found {found}")
+                weights[name] = value.to(torch.float32)
+        self.network.load_state_dict(weights, strict=False, assign=True)
         self.requires_grad_(False)
 
     def forward(self, pred: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of each image pair, computed in float32.
-
-        Args:
-            pred: (H, W, 3) or (B, H, W, 3), in [0, 1]; at least 31 pixels a side for AlexNet, 16 for VGG.
-            target: the same shape.
-
-        Returns:
-            A scalar, or (B,), of the type of ``pred``; 0 for identical images. Differentiable in both.
-
-        Raises:
-            ImageError: if the images cannot be compared or are too small for the network.
-        """
+        """LPIPS of each image pair, in float32; arguments, result and errors are those of :func:`lpips`."""
         a, b = as_nchw(pred, target)
         least = _BACKBONES[self.net].minimum
         if min(a.shape[2:]) < least:
@@ -118,13 +108,12 @@ def empty_network(net: Net) -> nn.Module:
 def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: bool = True) -> Lpips:
     """LPIPS with its weights, on the CPU.
 
-    The backbone comes from the first of these that there is: the file ``backbone``; what the
-    environment variable ``POINTSPLAT_LPIPS_WEIGHTS`` names; torch hub's checkpoint cache; torchvision's
-    download into that cache. A file may hold the whole network or its convolutions alone, and is
-    loaded with ``weights_only=True``.
+    The backbone comes from the first of these that there is: the file ``backbone``; what the environment variable
+    ``POINTSPLAT_LPIPS_WEIGHTS`` names; torch hub's checkpoint cache; torchvision's download into that cache. A file may
+    hold the whole network or its convolutions alone, and is loaded with ``weights_only=True``.
 
     Args:
-        net: ``"alex"`` (what most papers report) or ``"vgg"`` (what the training loss uses).
+        net: ``"alex"`` (in most papers) or ``"vgg"`` (in most losses).
         backbone: a local file; if given, nothing else is tried.
         download: whether the network may be used.
 
@@ -138,9 +127,8 @@ def load_lpips(net: Net = "alex", backbone: Path | str | None = None, download: 
         raise LpipsUnavailable(f"no LPIPS network is called {net!r}; expected one of {', '.join(_BACKBONES)}")
     empty_network(net)  # before anything is downloaded
     linear = _load(_linear_file(net))
-    path = _local_file(net) if backbone is None else Path(backbone)
-    if path is None:
-        path = _hub_file(net)
+    path = _file(net) if backbone is None else Path(backbone)
+    if backbone is None and not path.is_file():
         _download(net, path, download)
     state = _load(path)
     try:
@@ -153,24 +141,21 @@ def cached_lpips(net: Net, device: torch.device | str) -> Lpips:
     """LPIPS on a device, loaded at the first call and the same object afterwards. Arguments and errors are those of
     :func:`load_lpips`.
 
-    A failure is remembered as well, for ten minutes or until another file is found or the environment variable changes.
-    So a download that timed out is not tried again at every step, and weights that appear are used at the next call. A
+    A failed download is not tried again for ten minutes, unless a file is found or the environment variable changes. A
     caller whose result must not change over time, such as a training loss, has to remember a failure itself.
     """
     place = (net, str(torch.device(device)), os.environ.get(WEIGHTS_VARIABLE), torch.hub.get_dir())
     with _cache_lock:
         lpips = _loaded.get(place)
-        if lpips is not None:
-            return lpips
-        path = _local_file(net) if net in _BACKBONES else None
-        attempt = (place, path, path.stat().st_mtime_ns if path is not None else None)
-        if attempt in _failures:
-            raise LpipsUnavailable(_failures[attempt])
-        try:
-            lpips = _loaded[place] = load_lpips(net).to(device)
-        except LpipsUnavailable as error:
-            _failures[attempt] = str(error)
-            raise
+        if lpips is None:
+            missing = net in _BACKBONES and not _file(net).is_file()
+            if missing and place in _failures:
+                raise LpipsUnavailable(_failures[place])
+            try:
+                lpips = _loaded[place] = load_lpips(net).to(device)
+            except LpipsUnavailable as error:
+                _failures[place] = str(error)
+                raise
         return lpips
 
 
@@ -192,32 +177,26 @@ class ReportedLpips:
             return None
 
 
-_loaded: LRUCache[Hashable, Lpips] = LRUCache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
-_failures: TTLCache[Hashable, str] = TTLCache(maxsize=16, ttl=600.0)  # s
+_loaded: LRUCache[tuple, Lpips] = LRUCache(maxsize=4)  # 10 MB for alex, 59 MB for vgg
+_failures: TTLCache[tuple, str] = TTLCache(maxsize=16, ttl=600.0)  # s
 _cache_lock = threading.Lock()
 
 
-def _local_file(net: Net) -> Path | None:
-    """The backbone's file on this machine: the one that the environment variable names, or torch hub's copy.
+def _file(net: Net) -> Path:
+    """The backbone's file: what the environment variable names, else torch hub's, which may not be there.
     LpipsUnavailable if the variable names nothing that exists."""
-    named = os.environ.get(WEIGHTS_VARIABLE)
-    if named:
+    files = _BACKBONES[net].files
+    if named := os.environ.get(WEIGHTS_VARIABLE):
         place = Path(named).expanduser()
         if not place.exists():
             raise LpipsUnavailable(f"{place}: no such file or folder, though {WEIGHTS_VARIABLE} names it")
         if place.is_dir():
-            file = next((place / name for name in _BACKBONES[net].files if (place / name).is_file()), None)
-            if file is not None:
-                return file
+            for name in files:
+                if (place / name).is_file():
+                    return place / name
         elif not any(place.name in other.files for key, other in _BACKBONES.items() if key != net):
             return place  # unless its name is that of the other network's file
-    cached = _hub_file(net)
-    return cached if cached.is_file() else None
-
-
-def _hub_file(net: Net) -> Path:
-    """The file in torch hub's cache that torchvision downloads to."""
-    return Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONES[net].files[-1]
+    return Path(torch.hub.get_dir()) / "checkpoints" / files[-1]
 
 
 def _load(path: Path) -> Mapping[str, Tensor]:
@@ -230,15 +209,6 @@ def _load(path: Path) -> Mapping[str, Tensor]:
     if not isinstance(state, Mapping):
         raise LpipsUnavailable(f"{path}: holds a {type(state).__name__}; expected a state dict")
     return state
-
-
-def _expect(state: Mapping[str, Tensor], key: str, shape: tuple[int, ...]) -> Tensor:
-    value = state.get(key)
-    if not isinstance(value, Tensor):
-        raise LpipsUnavailable(f"lacks {key!r} (found {', '.join(map(str, list(state)[:3])) or 'no keys'})")
-    if tuple(value.shape) != shape:
-        raise LpipsUnavailable(f"{key!r} has shape {tuple(value.shape)}, expected {shape}")
-    return value.to(torch.float32)
 
 
 def _linear_file(net: Net) -> Path:

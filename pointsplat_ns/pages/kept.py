@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import keep_usable, one_line
+from pointsplat_ns.io.files import one_line
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import Merger

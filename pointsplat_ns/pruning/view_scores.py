@@ -14,9 +14,9 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.paper import ScoreError, log_volume
-from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, drawn_antialiased, project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 

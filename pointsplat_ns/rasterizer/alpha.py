@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 
 CLAMPED = ALPHA_MAX * (1 - 1e-6)
 """Alphas of at least this count as clamped; the margin covers the rounding of ALPHA_MAX to float32."""
@@ -46,10 +46,10 @@ def is_clamped(alpha: Tensor) -> Tensor:
     return alpha >= CLAMPED
 
 
-def is_drawn(after: Tensor, transmittance_min: float, out: Tensor | None = None) -> Tensor:
+def is_drawn(after: Tensor, out: Tensor | None = None) -> Tensor:
     """Mask of the pixels that a Gaussian does not finish, from the transmittance behind it; as 0 and 1 in ``out`` if
     that is given."""
-    return torch.gt(after, transmittance_min, out=out)
+    return torch.gt(after, TRANSMITTANCE_MIN, out=out)
 
 
 def transmittances(passing: Tensor, before: Tensor, out: Tensor) -> Tensor:

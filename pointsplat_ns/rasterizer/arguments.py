@@ -6,34 +6,27 @@ from typing import Any
 
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
+from pointsplat_ns.rasterizer.constants import QUALITIES
+
+NAMES = {
+    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+    "rasterize_mode": ("classic", "antialiased"),
+    "quality": tuple(QUALITIES),
+}
 
 
 def check_tensors(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor | tuple[Tensor, Tensor],
-    viewmats: Tensor,
-    Ks: Tensor,
-    sh_degree: int | None,
-    backgrounds: Tensor | None,
+    colors: Tensor | tuple[Tensor, Tensor], sh_degree: int | None, backgrounds: Tensor | None, **tensors: Tensor
 ) -> None:
     """Raise a ValueError that names the argument if a shape does not fit. Values are left alone: looking at them would
     have to wait for the device."""
-    n, c = (tensor.shape[0] if tensor.dim() else 0 for tensor in (means, viewmats))
+    n, c = (tensors[name].shape[0] if tensors[name].dim() else 0 for name in ("means", "viewmats"))
     wanted = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "opacities": (opacities, (n,)),
-        "viewmats": (viewmats, (c, 4, 4)),
-        "Ks": (Ks, (c, 3, 3)),
-    }
-    for name, (tensor, shape) in wanted.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
+        "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "viewmats": (c, 4, 4), "Ks": (c, 3, 3),
+    }  # fmt: skip
+    for name, expected in wanted.items():
+        if tuple(tensors[name].shape) != expected:
+            raise ValueError(f"{name} has shape {tuple(tensors[name].shape)}; expected {expected}")
     if c == 0:
         raise ValueError("viewmats holds no camera; expected at least one")
     shape = tuple(colors.shape) if isinstance(colors, Tensor) else _shape_together(colors, n, sh_degree)
@@ -74,34 +67,17 @@ def _check_harmonics(shape: tuple[int, ...], n: int, c: int, sh_degree: int) -> 
     return 3
 
 
-def check_options(
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    render_mode: str,
-    rasterize_mode: str,
-    quality: str | Quality,
-    memory_budget: int,
-) -> None:
+def check_options(width: int, height: int, near_plane: float, far_plane: float, **others: Any) -> None:
     """Raise a ValueError that names the argument if a number or name has no meaning."""
     if not (hasattr(width, "__index__") and hasattr(height, "__index__") and width >= 1 and height >= 1):
         raise ValueError(f"image is {width} x {height} pixels; expected whole numbers, at least 1 x 1")
     if not 0 <= near_plane < far_plane:  # NaN fails too, here and below
         raise ValueError(f"near_plane is {near_plane} and far_plane {far_plane}; expected 0 <= near_plane < far_plane")
-    for name, value in {"radius_clip": radius_clip, "eps2d": eps2d}.items():
-        if not 0 <= value < float("inf"):
-            raise ValueError(f"{name} is {value}; expected a number from 0")
-    if not memory_budget > 0:
-        raise ValueError(f"memory_budget is {memory_budget}; expected a number of bytes above 0")
-    _check_name("render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
-    _check_name("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
-    if not isinstance(quality, Quality):
-        _check_name("quality", quality, tuple(QUALITIES))
-
-
-def _check_name(argument: str, value: Any, names: tuple[str, ...]) -> None:
-    if value not in names:
-        raise ValueError(f"{argument} is {value!r}; expected {', '.join(names[:-1])} or {names[-1]}")
+    for name in ("radius_clip", "eps2d"):
+        if not 0 <= others[name] < float("inf"):
+            raise ValueError(f"{name} is {others[name]}; expected a number from 0")
+    if not others["memory_budget"] > 0:
+        raise ValueError(f"memory_budget is {others['memory_budget']}; expected a number of bytes above 0")
+    for name, names in NAMES.items():
+        if others[name] not in names:
+            raise ValueError(f"{name} is {others[name]!r}; expected {', '.join(names[:-1])} or {names[-1]}")

@@ -18,11 +18,11 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.compiled import blending as compiled_blending
-from pointsplat_ns.rasterizer.constants import TILE
-from pointsplat_ns.rasterizer.frame import BlendOptions
-from pointsplat_ns.rasterizer.precision import full_precision
+from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET, TILE
+from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
+from pointsplat_ns.system.tensors import full_precision
 
 
 def bytes_per_pair(colors: Tensor) -> int:
@@ -42,19 +42,19 @@ class Blend(torch.autograd.Function):
     """Blend projected Gaussians into the tiles of one region; see :func:`blend`."""
 
     @staticmethod
-    def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, options, absgrad_of):
+    def forward(ctx, means2d, cov2d, det, opacities, colors, footprints, region, keep_lists, compiled, absgrad_of):
         """The lists are kept for the backward pass only if ``keep_lists``."""
-        engine = compiled_blending if compiled_blending.can_blend(colors, options.compiled) else blocks
+        engine = compiled_blending if compiled_blending.can_blend(colors, compiled) else blocks
         tiles = footprints.tiles(region)
         image = colors.new_empty(tiles.offsets.numel() - 1, colors.shape[1], PIXELS)
         final = colors.new_empty(tiles.offsets.numel() - 1, PIXELS)
-        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, options.quality)
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, footprints.alpha_min)
         needs_grad = any(ctx.needs_input_grad)
         tape = engine.blend_region(footprints, tiles, inputs, image, final, needs_grad and keep_lists)
         if needs_grad:
             ctx.save_for_backward(means2d, cov2d, det, opacities, colors, final)
             ctx.kept = (tiles, tape) if keep_lists else None
-            ctx.arguments = footprints, region, options, absgrad_of, engine
+            ctx.arguments = footprints, region, absgrad_of, engine
         return image, final
 
     @staticmethod
@@ -62,8 +62,8 @@ class Blend(torch.autograd.Function):
     @full_precision
     def backward(ctx, grad_image, grad_final):
         means2d, cov2d, det, opacities, colors, final = ctx.saved_tensors
-        footprints, region, options, absgrad_of, engine = ctx.arguments
-        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, options.quality)
+        footprints, region, absgrad_of, engine = ctx.arguments
+        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, footprints.alpha_min)
         if ctx.kept:
             tiles, tape = ctx.kept
         else:
@@ -81,22 +81,22 @@ class Blend(torch.autograd.Function):
 
 
 def blend(
-    means2d: Tensor,  # [M, 2] pixels
-    cov2d: Tensor,  # [M, 3] xx, xy, yy, pixels^2
-    det: Tensor,  # [M] determinant of cov2d
-    opacities: Tensor,  # [M] in (0, 1]
-    colors: Tensor,  # [M, D]
+    seen: Projected,
+    colors: Tensor,
     footprints: Footprints,
-    options: BlendOptions = BlendOptions(),  # noqa: B008 - immutable
+    compiled: bool | None = None,
+    memory_budget: int = MEMORY_BUDGET,
     absgrad_of: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend Gaussians into images.
 
     Args:
+        seen: M projected Gaussians.
+        colors: (M, D)
         footprints: of the same Gaussians.
-        options: an image whose lists of pairs would take more than ``options.memory_budget`` bytes
-            is drawn in several regions, one after the other, and their lists are computed again for the
-            backward pass.
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
+        memory_budget: an image whose lists of pairs would take more bytes is drawn in several regions, one after the
+            other, and their lists are computed again for the backward pass.
         absgrad_of: called in the backward pass with the sums over pixels of the absolute gradients
             of means2d, (M, 2).
 
@@ -104,9 +104,7 @@ def blend(
         Colours (C, H, W, D) over black, and the remaining transmittance (C, H, W, 1).
     """
     cameras, width, height = footprints.cameras, footprints.width, footprints.height
-    regions = footprints.regions(max(1, options.memory_budget // bytes_per_pair(colors)))
-    if absgrad_of is not None and len(regions) > 1:
-        absgrad_of = _Summed(absgrad_of, len(regions))
+    regions = footprints.regions(max(1, memory_budget // bytes_per_pair(colors)))
 
     def assemble(parts: list[Tensor]) -> Tensor:
         """Regions run through rows of tiles, or through the columns of one row."""
@@ -119,25 +117,20 @@ def blend(
         whole = torch.cat(bands, dim=1) if len(bands) > 1 else bands[0]
         return whole[:, :height, :width]
 
+    absolute: list[Tensor] = []
+
+    def collect(values: Tensor) -> None:
+        absolute.append(values)
+        if absgrad_of is not None and len(absolute) == len(regions):
+            absgrad_of(sum(absolute[1:], start=absolute[0]))
+            absolute.clear()
+
     images, finals = [], []
     for region in regions:
         image, final = Blend.apply(
-            means2d, cov2d, det, opacities, colors, footprints, region, len(regions) == 1, options, absgrad_of
-        )
+            seen.means2d, seen.cov2d, seen.det, seen.opacities, colors, footprints, region, len(regions) == 1, compiled,
+            None if absgrad_of is None else collect,
+        )  # fmt: skip
         images.append(image)
         finals.append(final)
     return assemble(images), assemble(finals)
-
-
-class _Summed:
-    """Adds up what it is called with, and calls ``receiver`` with the sum at the last of ``calls`` calls."""
-
-    def __init__(self, receiver: Callable[[Tensor], None], calls: int):
-        self.receiver, self.left = receiver, calls
-        self.total: Tensor | None = None
-
-    def __call__(self, values: Tensor) -> None:
-        total = self.total = values if self.total is None else self.total + values
-        self.left -= 1
-        if self.left == 0:
-            self.receiver(total)

@@ -14,12 +14,76 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import eager
-from pointsplat_ns.rasterizer.frame import Chunk, Frame, Inputs, Tiles
+from pointsplat_ns.rasterizer.constants import TILE
+from pointsplat_ns.rasterizer.eager import Inputs
+from pointsplat_ns.rasterizer.eager import inputs_of as inputs_of  # part of this module's interface, as chain
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
-from pointsplat_ns.rasterizer.quadratics import chain as chain  # part of this module's interface
+from pointsplat_ns.rasterizer.quadratics import chain as chain
 from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
-inputs_of = Inputs.of
+
+class Tiles(NamedTuple):
+    """Some tiles, each (B,)."""
+
+    ids: Tensor  # int64, which tile of the region
+    x: Tensor  # centre, pixels
+    y: Tensor
+    start: Tensor  # int64, first pair
+    end: Tensor  # int64, one past the last pair
+
+    def take(self, rows: Tensor) -> Tiles:
+        return Tiles(*(values.index_select(0, rows) for values in self))
+
+
+class Chunk(NamedTuple):
+    """Tensors of one chunk of one block that the backward pass needs."""
+
+    tiles: Tiles
+    rows: Tensor | None  # [B] which tiles of the block are left; None while all are
+    first: int  # place in each tile's list
+    size: int  # S
+    before: Tensor  # [B, 64] transmittance before the chunk; 0 where the pixel is finished
+
+
+class Frame:
+    """The tiles of one region, longest list first, and their pairs."""
+
+    STEP = 16
+    """Gaussians blended at once for each tile, before the saturated tiles are dropped; chunks are multiples of it."""
+    LONGEST = 1024
+    """Largest number of Gaussians in a chunk."""
+
+    def __init__(self, footprints: Footprints, tiles: TileList, dtype: torch.dtype):
+        lengths = tiles.offsets[1:] - tiles.offsets[:-1]
+        self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
+        self.occupied = int((lengths > 0).sum())
+        ids = torch.sort(lengths, descending=True, stable=True).indices[: self.occupied]
+        x, y = (centre.to(dtype) for centre in tiles.centres(ids))
+        self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
+        self.pairs_count = tiles.gaussians.numel()
+        self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
+        # Pairs in a work array: on a CPU 2 MB in float32. The size does not depend on the number of threads, because
+        # sums are rounded by how lists are cut.
+        pairs = 2**18 if lengths.is_cuda else 2**13
+        self.block = max(1, min(pairs // self.STEP, self.occupied))  # tiles
+        self.capacity = pairs
+
+    def chunk_size(self, tiles: int, longest: int) -> int:
+        """Gaussians to blend at once: more where few tiles are left, no more than their lists hold."""
+        size = min(self.capacity // max(tiles, 1), longest + self.STEP - 1, self.LONGEST)
+        return max(size // self.STEP, 1) * self.STEP
+
+    def inside(self, tiles: Tiles) -> Tensor:
+        """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""
+        axis = torch.arange(TILE, device=tiles.x.device, dtype=torch.int64) - (TILE // 2)
+        columns = tiles.x[:, None] + axis < self.width
+        rows = tiles.y[:, None] + axis < self.height
+        return (rows[:, :, None] & columns[:, None, :]).view(-1, PIXELS).to(tiles.x.dtype)
+
+    def pairs(self, tiles: Tiles, first: int, size: int) -> Tensor:
+        """Places in the pair list of S Gaussians for each tile, (B * S,); one past all pairs where a list has ended."""
+        place = tiles.start[:, None] + torch.arange(first, first + size, device=tiles.start.device, dtype=torch.int64)
+        return place.masked_fill_(place >= tiles.end[:, None], self.pairs_count).view(-1)
 
 
 class Tape(NamedTuple):
@@ -77,7 +141,7 @@ def blend_region(
     if frame.occupied < frame.tiles:
         image.zero_()
         final.fill_(1.0)
-    work = eager.WorkArrays(frame, image)
+    work = eager.WorkArrays(frame.capacity, frame.block, image)
     begins = range(0, frame.occupied, frame.block)
     chunks = [_blend_block(frame, inputs, work, image, final, keep_tape, begin) for begin in begins]
     return Tape(frame, chunks) if keep_tape else None
@@ -144,7 +208,7 @@ def differentiate_region(
     sums = grad_image.new_empty(total + 1, MOMENTS + inputs.channels + (2 if absgrad else 0))  # in the tape's order
     sums[-1] = 0.0
     place = frame.gaussians.new_empty(total)  # in the pair list
-    work = eager.WorkArrays(frame, grad_image)
+    work = eager.WorkArrays(frame.capacity, frame.block, grad_image)
     for block in zip(tape.chunks, place.split(sizes), sums[:-1].split(sizes), strict=True):
         _blend_block_backward(frame, inputs, work, final, grad_image, grad_final, *block)
 

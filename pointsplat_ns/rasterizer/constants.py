@@ -1,7 +1,5 @@
 """The thresholds of 3D Gaussian rasterization, as the field uses them (3DGS, gsplat)."""
 
-from dataclasses import dataclass
-
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is not drawn on a pixel where its alpha is lower: it could not change an 8-bit image."""
 
@@ -25,20 +23,14 @@ SLACK = 1e-3
 """Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Thresholds that trade accuracy for speed."""
-
-    alpha_min: float = ALPHA_MIN
-    """A Gaussian is not drawn on a pixel where its alpha is lower."""
-    transmittance_min: float = TRANSMITTANCE_MIN
-    """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
-
-
-QUALITIES = {"exact": Quality(), "balanced": Quality(alpha_min=2 / 255), "fast": Quality(alpha_min=8 / 255)}
-"""Thresholds by name; what they gain and lose is measured by lab/speed/rasterizer.py. Only the lowest alpha pays.
+QUALITIES = {"exact": ALPHA_MIN, "balanced": 2 / 255, "fast": 8 / 255}
+"""The lowest alpha that is drawn, by the name of a quality; what they gain and lose is measured by
+lab/speed/rasterizer.py. Only this threshold pays.
 
 A higher stop threshold skips the opaque Gaussian that would have finished a pixel, and is wrong by up to 0.5 where it
 does. A lower degree of the harmonics loses far more for less time. exp2 in bfloat16 takes twice the time of float32,
 and tiles of 16 pixels were slower than of 8.
 """
+
+MEMORY_BUDGET = 2**31
+"""Bytes that the lists of pairs of one image may take before it is drawn in several regions."""

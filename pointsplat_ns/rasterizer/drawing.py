@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.blending import Blend, untiled
 from pointsplat_ns.rasterizer.constants import QUALITIES, TILE
-from pointsplat_ns.rasterizer.frame import BlendOptions
 from pointsplat_ns.rasterizer.projection import project_scene
 from pointsplat_ns.rasterizer.rendering import QualityName, finite_colors
 from pointsplat_ns.rasterizer.tiles import Footprints, Region
@@ -40,13 +38,8 @@ class Drawing:
     def __init__(self, scene: Gaussians, view: View, quality: QualityName = "exact"):
         seen = project_scene(scene, view)
         seen, self._colors, _ = finite_colors(seen, (scene.features_dc, scene.features_rest), 0, False, scene.sh_degree)
-        level = QUALITIES[quality]
-        self._seen, self._options = seen, BlendOptions(level)
-        self._footprints = Footprints(
-            seen.means2d, seen.cov2d, seen.det, seen.opacities, seen.depth_keys, torch.zeros_like(seen.ids), 1,
-            view.width, view.height, level.alpha_min,
-            binning.engine_of(None, seen.means2d, seen.cov2d, seen.det, seen.opacities),
-        )  # fmt: skip
+        self._seen = seen
+        self._footprints = Footprints(seen, None, 1, view.width, view.height, QUALITIES[quality])
         self.rows, self.columns = self._footprints.rows, self._footprints.columns
         """Number of tiles of 8 pixels along each side."""
         self._width, self._height = view.width, view.height
@@ -59,7 +52,7 @@ class Drawing:
         seen = self._seen
         image, through = Blend.apply(
             seen.means2d, seen.cov2d, seen.det, seen.opacities, self._colors, self._footprints, region, False,
-            self._options, None,
+            None, None,
         )  # fmt: skip
         height = min(region.bottom * TILE, self._height) - region.top * TILE
         width = min(region.right * TILE, self._width) - region.left * TILE

@@ -5,6 +5,8 @@ Shapes: B tiles of a block, S Gaussians of a chunk, 64 = TILE * TILE pixels, D c
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -16,16 +18,34 @@ from pointsplat_ns.rasterizer.alpha import (
     last_transmittance,
     transmittances,
 )
-from pointsplat_ns.rasterizer.frame import Frame, Inputs
-from pointsplat_ns.rasterizer.quadratics import PIXELS, Quadratics
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX
+from pointsplat_ns.rasterizer.quadratics import PIXELS, Quadratics, basis_of, table_of
+
+
+class Inputs(NamedTuple):
+    """Projected Gaussians to blend."""
+
+    table: Tensor  # [M + 1, 11 + D]
+    channels: int
+    may_clamp: bool  # some opacity exceeds ALPHA_MAX
+    alpha_min: float
+    basis: Tensor  # [6, 64]
+
+
+def inputs_of(
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, alpha_min: float
+) -> Inputs:
+    """Projected Gaussians (M, ...) and their colours (M, D) as blending reads them."""
+    table = table_of(means2d, cov2d, det, opacities, colors)
+    return Inputs(table, colors.shape[1], bool((opacities > ALPHA_MAX).any()), alpha_min, basis_of(means2d))
 
 
 class WorkArrays:
-    """The work arrays of a block, allocated once."""
+    """The work arrays of a block, allocated once: for so many pairs, and so many tiles."""
 
-    def __init__(self, frame: Frame, like: Tensor):
-        self._arrays = [like.new_empty(frame.capacity * PIXELS) for _ in range(3)]
-        self._through = like.new_empty((frame.capacity + frame.block) * PIXELS)
+    def __init__(self, pairs: int, tiles: int, like: Tensor):
+        self._arrays = [like.new_empty(pairs * PIXELS) for _ in range(3)]
+        self._through = like.new_empty((pairs + tiles) * PIXELS)
 
     def array(self, which: int, b: int, s: int) -> Tensor:
         """(B, S, 64)"""
@@ -57,7 +77,7 @@ def _pass_chunk(inputs: Inputs, pairs: Quadratics, before: Tensor, work: WorkArr
     b, s = pairs.rows.shape[:2]
     alpha = work.array(0, b, s)
     torch.mm(pairs.coefficients, inputs.basis, out=alpha.view(-1, PIXELS))
-    alpha = alphas_(alpha, inputs.quality.alpha_min, inputs.may_clamp)
+    alpha = alphas_(alpha, inputs.alpha_min, inputs.may_clamp)
     passing = torch.sub(1.0, alpha, out=work.array(1, b, s))
     return alpha, passing, transmittances(passing, before, work.through(b, s))
 
@@ -70,12 +90,11 @@ def blend_chunk(
     Returns:
         Transmittance after them, 0 where the pixel is finished, and the last one that was not, (B, 64) each.
     """
-    stop = inputs.quality.transmittance_min
     alpha, passing, through = _pass_chunk(inputs, pairs, before, work)
     weight = alpha.mul_(through[:, :-1])
     after = through[:, -1].clone()
-    if bool((~is_drawn(after, stop) & (before > 0)).any()):  # a pixel is finished by this chunk
-        drawn = is_drawn(through[:, 1:], stop, out=passing)
+    if bool((~is_drawn(after) & (before > 0)).any()):  # a pixel is finished by this chunk
+        drawn = is_drawn(through[:, 1:], out=passing)
         weight.mul_(drawn)
         finished = last_transmittance(through, drawn)
         last = torch.where(finished > 0, finished, last)
@@ -99,11 +118,10 @@ def blend_chunk_backward(
         Gradients of log alpha (B, S, 64) and of the colours (B, D, S), and ``behind`` for the chunk before.
     """
     b, s = pairs.rows.shape[:2]
-    stop = inputs.quality.transmittance_min
     alpha, passing, through = _pass_chunk(inputs, pairs, before, work)
     weight = work.array(2, b, s)
-    if not bool(is_drawn(through[:, -1], stop).all()):
-        alpha.mul_(is_drawn(through[:, 1:], stop, out=weight))
+    if not bool(is_drawn(through[:, -1]).all()):
+        alpha.mul_(is_drawn(through[:, 1:], out=weight))
     torch.mul(alpha, through[:, :-1], out=weight)
     odds = torch.div(alpha, passing, out=passing)
     at_clamp = is_clamped(alpha) if inputs.may_clamp else None

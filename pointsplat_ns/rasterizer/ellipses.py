@@ -51,13 +51,23 @@ class Ellipses(NamedTuple):
     widths: Tensor  # [M] int64, number of columns
 
 
-class Pairs(NamedTuple):
-    """Gaussians and tiles that touch, by tile, front to back."""
+class TileList(NamedTuple):
+    """For each tile of a region the Gaussians that touch it, front to back; P pairs in all."""
 
-    gaussians: Tensor  # [P] int64, rows of the projected Gaussians
-    offsets: Tensor  # [tiles + 1] int64, where each tile's pairs start
+    gaussians: Tensor  # [P] int64, rows of the projected Gaussians, grouped by tile
+    offsets: Tensor  # [cameras * rows * columns + 1] int64, where each tile's group starts
     places: Tensor  # [P] int64, where each pair stands when pairs are grouped by Gaussian (in depth order) instead
     counts: Tensor  # [M] int64, pairs of each Gaussian, in depth order
+    order: Tensor  # [M] int64, the Gaussians in depth order
+    region: Region
+
+    def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixel coordinates (x, y) of the centres of tiles (B,) of the region, int64."""
+        columns = self.region.columns
+        within = tiles % (self.region.rows * columns)
+        row = torch.div(within, columns, rounding_mode="floor")
+        column = within - row * columns
+        return (column + self.region.left) * TILE + TILE // 2, (row + self.region.top) * TILE + TILE // 2
 
 
 def ellipses_of(
@@ -87,7 +97,7 @@ def ellipses_of(
     return Ellipses(order, cameras.index_select(0, order), shapes, row0, row1, column0, widths)
 
 
-def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
+def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
     """Pair Gaussians with the tiles of a region, and sort the pairs by tile, then depth, then row of the input."""
     rows, columns = region.rows, region.columns
     owner, row, column0, column1 = _strips(ellipses, grid, region)
@@ -104,7 +114,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     tile, places = torch.sort(tile, stable=True)
     edges = torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype if tiles < 2**15 - 1 else torch.int64)
     offsets = torch.searchsorted(tile.to(edges.dtype), edges)
-    return Pairs(gaussian.index_select(0, places), offsets, places, counts)
+    return TileList(gaussian.index_select(0, places), offsets, places, counts, ellipses.order, region)
 
 
 def _strips(ellipses: Ellipses, grid: Grid, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -20,10 +20,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.geometry.transforms import rotation_components
+from pointsplat_ns.geometry.transforms import rotation_components, unit_rows
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN
-from pointsplat_ns.rasterizer.precision import full_precision
-from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
+from pointsplat_ns.system.tensors import full_precision
 
 
 class Lens(NamedTuple):

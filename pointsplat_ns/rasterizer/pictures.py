@@ -1,30 +1,29 @@
 """Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
 over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
 
-For float32 on a CPU, where the kernels were built. :func:`~pointsplat_ns.rasterization` gives the same pictures
-to rounding.
+:func:`~pointsplat_ns.rasterization` gives the same pictures to rounding. The trial of all kernels is here, too.
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
-from pointsplat_ns.rasterizer.compiled import blending, projection
+from pointsplat_ns.rasterizer.compiled import KERNELS, blending
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
-from pointsplat_ns.rasterizer.compiled.projection import camera_struct, count_meaningless, scene_struct
-from pointsplat_ns.rasterizer.constants import SLACK, TILE, Quality
+from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK, TILE
 from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.rasterizer.projection import camera_of
+from pointsplat_ns.rasterizer.projection import camera_of, count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.rasterizer.rendering import Colors, rasterization
 from pointsplat_ns.rasterizer.tiles import Region
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 
@@ -34,7 +33,7 @@ Camera = tuple[Tensor, Tensor, Lens]
 
 
 def _placed(
-    scene: Gaussians, camera: Camera, colored: bool, quality: Quality, most_pairs: int
+    scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, most_pairs: int
 ) -> tuple[KernelInputs, Tensor, Tensor, list[Tensor]] | None:
     """What is drawn on which tile.
 
@@ -42,7 +41,7 @@ def _placed(
         scene: N Gaussians.
         camera: where from.
         colored: whether the table has colours.
-        quality: thresholds.
+        alpha_min: a Gaussian is not drawn where its alpha is lower.
         most_pairs: largest number of pairs of a Gaussian and a tile.
 
     Returns:
@@ -55,7 +54,7 @@ def _placed(
         tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
     channels, whole = (3 if colored else 0), _whole(camera[2])
-    ranges = -(-count // projection.KERNELS.library.pointsplat_range())
+    ranges = -(-count // library.pointsplat_range())
     table, depths = torch.empty(count, 6 + channels, **FLOATS), torch.empty(count, **DOUBLES)
     ids, boxes = (
         torch.empty(count, dtype=torch.int32, device="cpu"),
@@ -64,12 +63,12 @@ def _placed(
     counts, heights = torch.empty(ranges, **INDICES), torch.empty(ranges, **INDICES)
     nearest = torch.empty(ranges, **DOUBLES)
     offsets = torch.zeros(whole.rows * whole.columns + 1, **INDICES)
-    inputs = KernelInputs(table, channels, quality)
+    inputs = KernelInputs(table, channels, alpha_min)
     task = KERNELS.structs["Placing"](
-        camera=camera_struct(KERNELS, *camera), scene=scene_struct(KERNELS, *tensors),
+        camera=camera_struct(*camera), scene=scene_struct(*tensors),
         first=coefficients[0], rest=coefficients[1], rest_row=3 * coefficients[1].shape[1],
         degree=scene.sh_degree if colored else -1,
-        rows=whole.rows, columns=whole.columns, log2_alpha_min=math.log2(quality.alpha_min), slack=SLACK,
+        rows=whole.rows, columns=whole.columns, log2_alpha_min=math.log2(alpha_min), slack=SLACK,
         most_color=torch.finfo(torch.float32).max ** 0.8, table=table, ids=ids, depths=depths, boxes=boxes,
         counts=counts, heights=heights, nearest=nearest, offsets=offsets,
     )  # fmt: skip
@@ -93,10 +92,10 @@ def _whole(lens: Lens) -> Region:
     return Region(0, -(-lens.height // TILE), 0, -(-lens.width // TILE))
 
 
-def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> tuple[Tensor, Tensor, int] | None:
+def picture(scene: Gaussians, camera: Camera, alpha_min: float, most_pairs: int) -> tuple[Tensor, Tensor, int] | None:
     """Colours (H, W, 3) over black, alpha (H, W, 1) and the number of Gaussians that no camera can draw; None if the
     pairs of Gaussians and tiles are more than ``most_pairs``."""
-    found = _placed(scene, camera, True, quality, most_pairs)
+    found = _placed(scene, camera, True, alpha_min, most_pairs)
     if found is None:
         return None
     (inputs, pairs, offsets, tensors), lens = found, camera[2]
@@ -104,14 +103,14 @@ def picture(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int)
     image, final = torch.empty(count, 3, PIXELS, **FLOATS), torch.empty(count, PIXELS, **FLOATS)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
-    on_threads(pairs.numel() >= SEVERAL, blending.KERNELS.library.pointsplat_blend, task)
+    on_threads(pairs.numel() >= SEVERAL, KERNELS.library.pointsplat_blend, task)
     colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
     return colors, 1.0 - through, count_meaningless(*tensors)
 
 
-def weights(scene: Gaussians, camera: Camera, quality: Quality, most_pairs: int) -> Tensor | None:
+def weights(scene: Gaussians, camera: Camera, alpha_min: float, most_pairs: int) -> Tensor | None:
     """Blending weight of each Gaussian, summed over the pixels of a picture, (N,); None as for :func:`picture`."""
-    found = _placed(scene, camera, False, quality, most_pairs)
+    found = _placed(scene, camera, False, alpha_min, most_pairs)
     if found is None:
         return None
     (inputs, pairs, offsets, _), lens = found, camera[2]
@@ -124,39 +123,70 @@ def can_draw(scene: Gaussians, wanted: bool | None) -> bool:
     :func:`~pointsplat_ns.rasterization`."""
     if torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors()):
         return False
-    return KERNELS.usable_for(wanted, scene.means) and blending.KERNELS.usable_for(wanted, scene.means)
+    return KERNELS.usable_for(wanted, scene.means)
 
 
+@KERNELS.tried_by
 def _as_torch() -> bool:
-    """Whether the kernels draw some Gaussians, and weigh them, as torch does."""
+    """Whether all kernels of the rasterizer do what torch does: projection, colours of each degree, tiles and blending
+    of two images of some Gaussians, with gradients, and pictures and weights of a scene."""
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, **FLOATS)
 
+    rasterized: Any = rasterization  # its arguments are lists here
     count, width, height = 90, 43, 38
     means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0], **FLOATS)
-    sh = random(count, 3), 0.3 * random(count, 15, 3)
-    scene = Gaussians(means, 0.8 * random(count, 3) - 1.5, random(count, 4), random(count, 1), *sh)
-    viewmat, K = torch.eye(4, **FLOATS), torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]], **FLOATS)
-    camera = camera_of(viewmat, K, width, height, 0.01, math.inf, 0.0, 0.3, True)
+    shapes = random(count, 4), (0.8 * random(count, 3) - 1.5).exp(), random(count).sigmoid()
+    first, rest = random(count, 3), 0.3 * random(count, 15, 3)
+    views = torch.eye(4, **FLOATS).repeat(2, 1, 1)
+    views[1, 0, 3] = 0.5
+    K = torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]], **FLOATS)
+    weights_of_pixels = random(2, height, width, 5)
+    spoilt = [value.clone() for value in (means, *shapes)]
+    for row, (value, wrong) in enumerate(zip(spoilt, (math.nan, math.inf, -1.0, -1.0), strict=True)):
+        value[row] = wrong
 
-    def by_torch(colors: Colors, sh_degree: int | None) -> tuple[Tensor, Tensor]:
-        image, alpha, _ = rasterization(
-            scene.means, scene.quats, scene.stds, scene.alphas, colors, viewmat[None], K[None], width, height,
-            sh_degree=sh_degree, rasterize_mode="antialiased", compiled=False,
+    def drawn(compiled: bool, degree: int | None, **options: Any) -> list[Tensor]:
+        """Images, alphas, what is seen, and the gradients."""
+        leaves = [value.clone().requires_grad_() for value in (*spoilt, first, rest, views)]
+        colors = first if degree is None else torch.cat([leaves[4][:, None], leaves[5]], 1)
+        given: Colors = (leaves[4], leaves[5]) if degree == 3 else colors
+        image, alphas, meta = rasterized(
+            *leaves[:4], given, leaves[6], K.expand(2, 3, 3), width, height, sh_degree=degree, absgrad=True,
+            compiled=compiled, **options,
         )  # fmt: skip
-        return image[0], alpha[0]
+        both = torch.cat([image, alphas], -1)
+        grads = torch.autograd.grad(
+            (both * weights_of_pixels[..., : both.shape[-1]]).sum(), leaves, materialize_grads=True
+        )
+        seen = [meta["gaussian_ids"], meta["radii"], torch.tensor([meta["skipped"]], **INDICES)]
+        return [image, alphas, meta["means2d"].absgrad, meta["conics"], meta["depths"], *grads, *seen]
 
-    with torch.no_grad():
-        image, alpha = by_torch(sh, 3)
-        drawn, weighed = picture(scene, camera, Quality(), 10**6), weights(scene, camera, Quality(), 10**6)
+    cases: list[dict[str, Any]] = [
+        {"degree": 0, "render_mode": "D"}, {"degree": 1, "render_mode": "RGB+ED", "memory_budget": 30_000},
+        {"degree": 2}, {"degree": 3, "rasterize_mode": "antialiased"},
+    ]  # fmt: skip
     with torch.enable_grad():
+        for case in cases:
+            (*ours, ids, radii, skipped), (*torchs, torchs_ids, torchs_radii, torchs_skipped) = (
+                drawn(compiled, **case) for compiled in (True, False)
+            )
+            if not (torch.equal(ids, torchs_ids) and torch.equal(skipped, torchs_skipped)):
+                return False
+            if not agreement([*ours, radii.float()], [*torchs, torchs_radii.float()], off=1e-3, share=1e-2):
+                return False
+        # a picture in one pass, and the weights, which are the gradient of its sum by colours of one channel
         flat = torch.zeros(count, 1, requires_grad=True, **FLOATS)
-        (pixels,) = torch.autograd.grad(by_torch(flat, None)[0].sum(), flat)
-    if drawn is None or weighed is None:
+        options: dict[str, Any] = {"rasterize_mode": "antialiased", "compiled": False}
+        view = views[:1], K[None], width, height
+        (pixels,) = torch.autograd.grad(rasterized(means, *shapes, flat, *view, **options)[0].sum(), flat)
+    with torch.no_grad():
+        image, alpha, _ = rasterized(means, *shapes, (first, rest), *view, sh_degree=3, **options)
+        scene = Gaussians(means, shapes[1].log(), shapes[0], shapes[2].logit()[:, None], first, rest)
+        camera = camera_of(views[0], K, width, height, 0.01, math.inf, 0.0, 0.3, True)
+        ours_drawn, weighed = picture(scene, camera, ALPHA_MIN, 10**6), weights(scene, camera, ALPHA_MIN, 10**6)
+    if ours_drawn is None or weighed is None:
         return False
-    return agreement([*drawn[:2], weighed], [image, alpha, pixels[:, 0]], off=1e-4, share=1e-2)
-
-
-KERNELS = Kernels("the rasterizer", Path(__file__).with_name("compiled") / "pictures.cpp", _as_torch)
+    return agreement([*ours_drawn[:2], weighed], [image[0], alpha[0], pixels[:, 0]], off=1e-4, share=1e-2)

@@ -16,9 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.alpha import alphas_, is_clamped, is_drawn, last_transmittance, transmittances
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.quadratics import LOG2E, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints
@@ -53,11 +52,7 @@ def sum_over_pixels(
     """
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
-    camera = torch.zeros_like(seen.ids)
-    engine = binning.engine_of(None, means2d, cov2d, det, seen.opacities)
-    footprints = Footprints(
-        means2d, cov2d, det, seen.opacities, seen.depth_keys, camera, 1, width, height, engine=engine
-    )
+    footprints = Footprints(seen, None, 1, width, height)
     lists = footprints.tiles(footprints.whole)
     gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)
@@ -97,6 +92,6 @@ def _walk(shape: Tensor, ids: Tensor, pixel_x: Tensor, pixel_y: Tensor, listed: 
     clamped = is_clamped(alpha)
     through = alpha.new_empty(alpha.shape[0], alpha.shape[1] + 1, PIXELS)
     transmittances(1.0 - alpha, torch.ones_like(alpha[:, 0]), out=through)
-    drawn = is_drawn(through[:, 1:], TRANSMITTANCE_MIN)
+    drawn = is_drawn(through[:, 1:])
     final = last_transmittance(through, drawn)
     return PixelBlock(ids, alpha.mul_(drawn), through[:, :-1], final, gx, d * y - r * gx, clamped)

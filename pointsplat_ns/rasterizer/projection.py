@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer.compiled import projection as compiled_projection
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.compiled import projection as by_kernels
 from pointsplat_ns.rasterizer.ewa import Lens, Project
 from pointsplat_ns.views import EPS2D, View, Views
 
@@ -64,20 +65,9 @@ def _close(values: Sequence[float], wanted: Sequence[float]) -> bool:
 
 
 @torch.no_grad()
-def count_meaningless(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, compiled: bool | None = None
-) -> int:
-    """Number of Gaussians that no camera can draw: a NaN or infinite parameter, a negative scale or opacity.
-
-    Args:
-        means: (N, 3)
-        quats: (N, 4)
-        scales: (N, 3)
-        opacities: (N,)
-        compiled: as for :func:`~pointsplat_ns.rasterization`.
-    """
-    if compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities):
-        return compiled_projection.count_meaningless(means, quats, scales, opacities)
+def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
+    """Number of Gaussians (N, ...) that no camera can draw: a NaN or infinite parameter, a negative scale or
+    opacity."""
     # one NaN or infinity spoils a sum, so a clean scene costs four sums and one answer
     total = means.sum() + quats.sum() + scales.sum() + opacities.sum()
     if bool(total.isfinite() & ~(scales < 0).any() & ~(opacities < 0).any()):
@@ -172,6 +162,6 @@ def project(
         ValueError: if a focal length is zero, or the camera is not finite, has skew or is not a rigid motion.
     """
     view, centre, lens = camera_of(viewmat, K, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased)
-    suited = compiled_projection.KERNELS.usable_for(compiled, means, quats, scales, opacities)
-    function = compiled_projection.CompiledProject if suited else Project
+    suited = KERNELS.usable_for(compiled, means, quats, scales, opacities)
+    function = by_kernels.CompiledProject if suited else Project
     return Projected(*function.apply(means, quats, scales, opacities, view, centre, lens))

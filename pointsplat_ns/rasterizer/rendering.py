@@ -1,22 +1,21 @@
-"""The public function: gsplat's signature and return shape, in pure torch."""
+"""The public function, called as gsplat's, in pure torch."""
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer import binning
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
-from pointsplat_ns.rasterizer.colors import sh_to_color
-from pointsplat_ns.rasterizer.constants import QUALITIES, TILE, Quality
-from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET, BlendOptions
-from pointsplat_ns.rasterizer.precision import full_precision
+from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET, QUALITIES, TILE
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, on_cpu, project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.system.tensors import full_precision
 from pointsplat_ns.views import EPS2D
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
@@ -78,15 +77,17 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
     channel_chunk: int = 32,
+    *,
     backend: Literal["torch", "gsplat", "auto"] = "torch",
-    quality: QualityName | Quality = "exact",
+    quality: QualityName = "exact",
     compiled: bool | None = None,
     memory_budget: int = MEMORY_BUDGET,
 ) -> tuple[Tensor, Tensor, dict]:
     """Render 3D Gaussians from C pinhole cameras, on any torch device.
 
-    Takes what ``gsplat.rasterization`` takes and returns what it returns. Differentiable in means,
-    quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
+    Called as ``gsplat.rasterization`` (1.4.0). ``distributed``, ``camera_model``, ``covars`` and SH of degree 4 are not
+    taken, and ``meta`` has no lists of tiles; docs/rasterizer.md lists all differences. Differentiable in means, quats,
+    scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
     they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
     place the camera exactly, however far from the origin. Cameras are best given on the CPU, where they are computed
     with in float64: those on a GPU are fetched from it, which waits for all that it has to do.
@@ -124,7 +125,7 @@ def rasterization(
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
         backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so where it can. The arguments
             below have no effect on gsplat.
-        quality: thresholds that trade accuracy for speed, or their name; see ``QUALITIES``.
+        quality: by which lowest alpha to trade accuracy for speed; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
             most four channels): None where they were built; True warns where they were not; False never.
         memory_budget: bytes that lists of pairs may take before the image is drawn in several
@@ -164,10 +165,14 @@ def rasterization(
             rasterize_mode, channel_chunk,
         )  # fmt: skip
     opacities = opacities[:, 0] if opacities.dim() == 2 and opacities.shape[1] == 1 else opacities
-    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds)
+    check_tensors(
+        colors, sh_degree, backgrounds,
+        means=means, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks,
+    )  # fmt: skip
     check_options(
-        width, height, near_plane, far_plane, radius_clip, eps2d, render_mode, rasterize_mode, quality, memory_budget
-    )
+        width, height, near_plane, far_plane, radius_clip=radius_clip, eps2d=eps2d, render_mode=render_mode,
+        rasterize_mode=rasterize_mode, quality=quality, memory_budget=memory_budget,
+    )  # fmt: skip
     dtype = means.dtype if means.dtype in (torch.float32, torch.float64) else torch.float32
     means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
@@ -182,7 +187,7 @@ def rasterization(
         )
         for c in range(cameras)
     ]  # fmt: skip
-    skipped = count_meaningless(means, quats, scales, opacities, compiled)
+    skipped = count_meaningless(means, quats, scales, opacities)
     channels = []
     if render_mode.startswith("RGB"):
         colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]
@@ -190,33 +195,25 @@ def rasterization(
         channels.append(_cat([values for _, values, _ in colored]))
         skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
     camera_ids = _cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
-    gaussian_ids = torch.cat([s.ids for s in seen])
-    dense_ids = camera_ids * n + gaussian_ids
-
-    def packed_of(name: str) -> Tensor:
-        return _cat([getattr(s, name) for s in seen])
+    drawn = Projected(**{f.name: _cat([getattr(s, f.name) for s in seen]) for f in fields(Projected)})
+    dense_ids = camera_ids * n + drawn.ids
 
     def dense(values: Tensor) -> Tensor:
         empty = values.new_zeros(cameras * n, *values.shape[1:])
         return empty.index_copy(0, dense_ids, values).view(cameras, n, *values.shape[1:])
 
-    meta_means2d = packed_of("means2d")
     if packed:
-        means2d = meta_means2d = meta_means2d.view_as(meta_means2d)
+        means2d = meta_means2d = drawn.means2d.view_as(drawn.means2d)
     else:
-        meta_means2d = dense(meta_means2d)
+        meta_means2d = dense(drawn.means2d)
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
-    cov2d, det, alphas, depths = (packed_of(name) for name in ("cov2d", "det", "opacities", "depths"))
+    drawn = replace(drawn, means2d=means2d)
 
     color_channels = channels[0].shape[-1] if channels else 0
     if render_mode != "RGB":
-        channels.append(depths[:, None])
+        channels.append(drawn.depths[:, None])
 
-    level = quality if isinstance(quality, Quality) else QUALITIES[quality]
-    footprints = Footprints(
-        means2d, cov2d, det, alphas, packed_of("depth_keys"), camera_ids, cameras, width, height, level.alpha_min,
-        binning.engine_of(compiled, means2d, cov2d, det, alphas),
-    )  # fmt: skip
+    footprints = Footprints(drawn, camera_ids, cameras, width, height, QUALITIES[quality], compiled)
 
     def keep_absgrad(values: Tensor) -> None:
         if not packed:
@@ -224,9 +221,8 @@ def rasterization(
         setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
     image, through = blend(
-        means2d, cov2d, det, alphas, _cat(channels, dim=-1), footprints,
-        BlendOptions(level, compiled, memory_budget), keep_absgrad if absgrad else None,
-    )  # fmt: skip
+        drawn, _cat(channels, dim=-1), footprints, compiled, memory_budget, keep_absgrad if absgrad else None
+    )
     accumulated = 1.0 - through
 
     if backgrounds is not None and color_channels:
@@ -239,10 +235,10 @@ def rasterization(
 
     with torch.no_grad():
         arrays = {
-            "radii": packed_of("radii"),
-            "depths": depths.detach(),
-            "conics": _cat([s.conics for s in seen]),
-            "opacities": alphas.detach(),
+            "radii": drawn.radii,
+            "depths": drawn.depths.detach(),
+            "conics": drawn.conics,
+            "opacities": drawn.opacities.detach(),
         }
         if not packed:
             arrays = {name: dense(values) for name, values in arrays.items()}
@@ -250,7 +246,7 @@ def rasterization(
         **arrays,
         "means2d": meta_means2d,
         "camera_ids": camera_ids if packed else None,
-        "gaussian_ids": gaussian_ids if packed else None,
+        "gaussian_ids": drawn.ids if packed else None,
         "skipped": skipped,
         "width": width,
         "height": height,

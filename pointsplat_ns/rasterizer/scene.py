@@ -11,8 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import pictures
-from pointsplat_ns.rasterizer.constants import QUALITIES, Quality
-from pointsplat_ns.rasterizer.frame import MEMORY_BUDGET
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, MEMORY_BUDGET, QUALITIES
 from pointsplat_ns.rasterizer.projection import camera_of, drawn_antialiased
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
 from pointsplat_ns.system.threads import one_thread, suitable_threads
@@ -144,7 +143,7 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
     with suitable_threads(scene.device):
         if pictures.can_draw(scene, compiled):
-            weights = pictures.weights(scene, _camera(scene, view), Quality(), MOST_PAIRS)
+            weights = pictures.weights(scene, _camera(scene, view), ALPHA_MIN, MOST_PAIRS)
             if weights is not None:
                 return weights
         with torch.enable_grad():

@@ -1,4 +1,5 @@
-"""Real spherical harmonics up to degree 3, and colours from them in torch."""
+"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled kernels
+(:mod:`~pointsplat_ns.rasterizer.compiled.colors`)."""
 
 from __future__ import annotations
 
@@ -6,9 +7,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.geometry.harmonics import C1, C2, C3, basis_rows
-from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.rasterizer.precision import full_precision
+from pointsplat_ns.geometry.harmonics import C1, C2, C3, SH_C0, basis_rows
+from pointsplat_ns.geometry.transforms import unit_rows
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.compiled.colors import CompiledColor
+from pointsplat_ns.system.tensors import full_precision
 
 
 def check_degree(degree: int) -> None:
@@ -38,21 +41,6 @@ def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
     return torch.stack([gx, gy, gz])
 
 
-def unit_rows(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (D, M) of the columns of (D, M), and the inverse of their lengths (M).
-
-    A zero vector, or one shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST`, becomes zero, and so does
-    its inverse length: it has no gradient. The length is taken after division by the largest component, so that neither
-    1e-30 nor 1e30 under- or overflows.
-    """
-    largest = vectors.abs().amax(dim=0)
-    zero = largest < SHORTEST
-    inverse = largest.masked_fill(zero, torch.inf).reciprocal_()
-    scaled = vectors * inverse
-    length = (scaled * scaled).sum(dim=0).masked_fill_(zero, 1.0).rsqrt_()
-    return scaled.mul_(length), inverse.mul_(length)
-
-
 def _blocks(count: int, on_cpu: bool) -> list[slice]:
     """Pieces of the work: on a CPU the coefficients of one piece stay in the cache, and no copy of all is made."""
     # On a CPU 0.8 MB of coefficients at degree 3 at once.
@@ -66,7 +54,7 @@ def offset(color: Tensor) -> Tensor:
 
 
 class Color(torch.autograd.Function):
-    """Colours of some rows of SH coefficients; see :func:`~pointsplat_ns.rasterizer.colors.sh_to_color`."""
+    """Colours of some rows of SH coefficients; see :func:`sh_to_color`."""
 
     @staticmethod
     def forward(ctx, directions, coefficients, ids, degree):
@@ -110,3 +98,42 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
     check_degree(degree)
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
+
+
+def sh_to_color(
+    directions: Tensor,
+    coefficients: Tensor | tuple[Tensor, Tensor],
+    degree: int,
+    ids: Tensor | None = None,
+    compiled: bool | None = None,
+) -> Tensor:
+    """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
+
+    Args:
+        directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
+            the basis at zero.
+        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored. Or the first of
+            each and the others, (N, 3) and (N, K - 1, 3): the kernels then bring nothing together.
+        degree: 0 to 3.
+        ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
+
+    Returns:
+        (M, 3), not below 0; NaN where a coefficient is not finite.
+
+    Raises:
+        ValueError: if the degree is not 0 to 3, or there are too few coefficients.
+    """
+    check_degree(degree)
+    first, rest = coefficients if isinstance(coefficients, tuple) else (coefficients, None)
+    used, stored = (degree + 1) ** 2, first.shape[-2] if rest is None else 1 + rest.shape[-2]
+    if stored < used:
+        raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
+    if ids is None:
+        ids = torch.arange(first.shape[0], device=first.device, dtype=torch.int64)
+    if KERNELS.usable_for(compiled, directions, first, *([] if rest is None else [rest])):
+        # a constant has no direction
+        return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
+    if degree == 0:
+        return offset(SH_C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
+    return Color.apply(directions, first if rest is None else torch.cat([first[:, None], rest], 1), ids, degree)

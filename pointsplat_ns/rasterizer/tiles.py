@@ -10,36 +10,17 @@ list does not depend on the region that it is part of.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from types import ModuleType
-
 import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.compiled import tiles as by_kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.ellipses import Grid
-from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface
-
-
-@dataclass
-class TileList:
-    """For each tile of a region the Gaussians that touch it, front to back; P pairs in all."""
-
-    gaussians: Tensor  # [P] int64, rows of the projected Gaussians, grouped by tile
-    offsets: Tensor  # [cameras * rows * columns + 1] int64, where each tile's group starts
-    places: Tensor  # [P] int64, where each pair stands when pairs are grouped by Gaussian (in depth order) instead
-    counts: Tensor  # [M] int64, pairs of each Gaussian, in depth order
-    order: Tensor  # [M] int64, the Gaussians in depth order
-    region: Region
-
-    def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel coordinates (x, y) of the centres of tiles (B,) of the region, int64."""
-        columns = self.region.columns
-        within = tiles % (self.region.rows * columns)
-        row = torch.div(within, columns, rounding_mode="floor")
-        column = within - row * columns
-        return (column + self.region.left) * TILE + TILE // 2, (row + self.region.top) * TILE + TILE // 2
+from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface, as the next
+from pointsplat_ns.rasterizer.ellipses import TileList as TileList
+from pointsplat_ns.rasterizer.projection import Projected
 
 
 def _by_depth(depths: Tensor) -> Tensor:
@@ -51,30 +32,37 @@ def _by_depth(depths: Tensor) -> Tensor:
 
 
 class Footprints:
-    """The 1/255 ellipses of projected Gaussians, in depth order."""
+    """The ellipses of projected Gaussians within which they are drawn, in depth order, found in torch
+    (:mod:`~pointsplat_ns.rasterizer.ellipses`) or by compiled kernels.
+
+    Args:
+        seen: M Gaussians.
+        camera_ids: (M,) int64, the image that each belongs to; None for one camera.
+        cameras: number of images.
+        width, height: of each image, pixels.
+        alpha_min: a Gaussian is not drawn where its alpha is lower.
+        compiled: as for :func:`~pointsplat_ns.rasterization`.
+    """
 
     @torch.no_grad()
     def __init__(
         self,
-        means2d: Tensor,  # [M, 2] pixels
-        cov2d: Tensor,  # [M, 3] xx, xy, yy
-        det: Tensor,  # [M]
-        opacities: Tensor,  # [M]
-        depths: Tensor,  # [M] from any plane, which may be another for each camera
-        camera_ids: Tensor,  # [M] int64
+        seen: Projected,
+        camera_ids: Tensor | None,
         cameras: int,
         width: int,
         height: int,
         alpha_min: float = ALPHA_MIN,
-        engine: ModuleType = in_torch,  # from binning.engine_of
+        compiled: bool | None = None,
     ):
-        self.cameras, self.width, self.height = cameras, width, height
+        self.cameras, self.width, self.height, self.alpha_min = cameras, width, height, alpha_min
         self.rows, self.columns = -(-height // TILE), -(-width // TILE)  # of tiles
         self._grid = Grid(cameras, height, self.rows, self.columns)
-        self._engine = engine
-        self._ellipses = engine.ellipses_of(
-            means2d, cov2d, det, opacities, _by_depth(depths.contiguous()), camera_ids, self._grid, alpha_min
-        )
+        shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
+        self._engine = by_kernels if KERNELS.usable_for(compiled, *shapes) else in_torch
+        order = _by_depth(seen.depth_keys.contiguous())
+        camera_ids = torch.zeros_like(seen.ids) if camera_ids is None else camera_ids
+        self._ellipses = self._engine.ellipses_of(*shapes, order, camera_ids, self._grid, alpha_min)
 
     @property
     def whole(self) -> Region:
@@ -106,8 +94,7 @@ class Footprints:
     @torch.no_grad()
     def tiles(self, region: Region) -> TileList:
         """Pair Gaussians with tiles and sort the pairs by tile, then depth, then row of the input."""
-        pairs = self._engine.pairs_of(self._ellipses, self._grid, region)
-        return TileList(**pairs._asdict(), order=self._ellipses.order, region=region)
+        return self._engine.pairs_of(self._ellipses, self._grid, region)
 
 
 def _spread(first: Tensor, lengths: Tensor, amounts: Tensor | int, bins: int) -> list[int]:

@@ -11,14 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 
-class Limit(NamedTuple):
-    """A limit on the cores of this process and others, and what they have used of it."""
-
-    cores: float
-    seconds: float
-    """CPU time that all processes under the limit have used so far; 0 where it is not known."""
-
-
 class Group(NamedTuple):
     """A control group of Linux that limits cores."""
 
@@ -45,9 +37,10 @@ class OtherPrograms:
         self._before = self._read()
 
     @staticmethod
-    def _read() -> tuple[float, float, list[Limit]]:
-        """Seconds of the clock and of this process on cores, and all limits."""
-        groups = [Limit(group.quota, _seconds_of(group.folder)) for group in limiting_groups()]
+    def _read() -> tuple[float, float, list[tuple[float, float]]]:
+        """Seconds of the clock and of this process on cores, and of each limit its cores and the seconds that all
+        processes have used of them."""
+        groups = [(group.quota, _seconds_of(group.folder)) for group in limiting_groups()]
         return time.monotonic(), time.process_time(), [_machine(), *groups]
 
     def cores(self) -> float:
@@ -56,14 +49,16 @@ class OtherPrograms:
         (start, own_before, before), (end, own_after, after) = self._before, self._read()
         if end <= start:
             return 0.0
-        own = (own_after - own_before) / (end - start)
-        used = ((now.seconds - then.seconds) / (end - start) for now, then in zip(after, before, strict=True))
-        left = min(limit.cores - max(0.0, all_used - own) for limit, all_used in zip(after, used, strict=True))
+        own = own_after - own_before
+        left = min(
+            limit - max(0.0, now - then - own) / (end - start)
+            for (limit, now), (_, then) in zip(after, before, strict=True)
+        )
         return min(max(0.0, cores() - left), float(cores()))
 
 
-def _machine() -> Limit:
-    """The cores that this process may be scheduled on; where the system does not say what is used, nothing is."""
+def _machine() -> tuple[float, float]:
+    """The cores that this process may be scheduled on, and the seconds used of them; 0 if they are unknown."""
     import psutil
 
     allowed = _allowed()
@@ -72,7 +67,7 @@ def _machine() -> Limit:
     except (OSError, psutil.Error):
         times = []
     seen = [times[number] for number in allowed if number < len(times)]  # a container may be shown fewer
-    return Limit(len(seen) or len(allowed), sum(_busy(each) for each in seen))
+    return float(len(seen) or len(allowed)), float(sum(_busy(each) for each in seen))
 
 
 def _busy(times) -> float:
@@ -88,22 +83,17 @@ class FreeCores:
     thirds of a core where two threads of this process compete with it for two.
     """
 
-    PAUSE = 1.0
-    """Least time between two looks, seconds: a look takes a millisecond."""
-    FIRST = 0.1
-    """How long the first look takes, seconds: the system counts time in hundredths."""
-
     def __init__(self) -> None:
         self._others: OtherPrograms | None = None
         self._looked, self._count = -math.inf, 1
 
     def __call__(self) -> int:
         """The number as the latest look found it, at least 1."""
-        if time.monotonic() - self._looked >= self.PAUSE:
+        if time.monotonic() - self._looked >= 1.0:  # seconds; a look takes a millisecond
             others = self._others
             if others is None:
                 others = OtherPrograms()
-                time.sleep(self.FIRST)
+                time.sleep(0.1)  # the system counts time in hundredths of a second
             self._count = max(1, cores() - round(others.cores()))
             self._others, self._looked = OtherPrograms(), time.monotonic()
         return self._count
@@ -121,49 +111,29 @@ def cpu_quota(root: Path = Path("/")) -> float | None:
 
 @functools.cache
 def limiting_groups(root: Path = Path("/")) -> tuple[Group, ...]:
-    """Linux's control groups that limit the cores of this process: its group and those above. ``proc`` and ``sys`` are
-    below ``root``."""
+    """Linux's control groups (version 2) that limit the cores of this process: its group and those above. ``proc`` and
+    ``sys`` are below ``root``."""
     try:
         lines = (root / "proc/self/cgroup").read_text("utf-8").splitlines()
     except OSError:
         return ()
-    found = []
+    top, found = root / "sys/fs/cgroup", []
     for line in lines:
-        _, controllers, group = (line.split(":", 2) + ["", ""])[:3]
-        if controllers == "":  # version 2
-            top, quota_of = root / "sys/fs/cgroup", _quota_v2
-        elif "cpu" in controllers.split(","):
-            top, quota_of = root / "sys/fs/cgroup" / controllers, _quota_v1
-        else:
-            continue
-        folder = top / group.lstrip("/")
-        # In a container, the group may be named as the host sees it, and be mounted as the top.
-        folders = [each for each in (folder, *folder.parents) if each.is_relative_to(top)]
-        found += [Group(quota, each) for each in folders if (quota := quota_of(each)) is not None]
+        if line.startswith("0::/"):
+            folder = top / line[4:]
+            # In a container, the group may be named as the host sees it, and be mounted as the top.
+            for each in (folder, *folder.parents):
+                with suppress(OSError, ValueError, ZeroDivisionError):  # "max": no limit
+                    quota, period = (each / "cpu.max").read_text("utf-8").split()
+                    found.append(Group(int(quota) / int(period), each))
+                if each == top:
+                    break
     return tuple(found)
-
-
-def _quota_v2(folder: Path) -> float | None:
-    try:
-        quota, period = (folder / "cpu.max").read_text("utf-8").split()
-        return None if quota == "max" else int(quota) / int(period)
-    except (OSError, ValueError, ZeroDivisionError):
-        return None
-
-
-def _quota_v1(folder: Path) -> float | None:
-    try:
-        quota, period = (int((folder / f"cpu.cfs_{name}_us").read_text("utf-8")) for name in ("quota", "period"))
-        return None if quota <= 0 else quota / period
-    except (OSError, ValueError, ZeroDivisionError):
-        return None
 
 
 def _seconds_of(folder: Path) -> float:
     """CPU time that a control group has used, seconds; 0 if it does not say."""
-    with suppress(OSError, ValueError, IndexError):  # version 2
+    with suppress(OSError, ValueError, IndexError):
         words = (folder / "cpu.stat").read_text("utf-8").split()
         return int(words[words.index("usage_usec") + 1]) / 1e6
-    with suppress(OSError, ValueError):  # version 1
-        return int((folder / "cpuacct.usage").read_text("utf-8")) / 1e9
     return 0.0

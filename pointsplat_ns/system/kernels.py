@@ -16,7 +16,7 @@ import os
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, ClassVar
@@ -46,10 +46,9 @@ class Pointer:
     def address(self, value: Any) -> int | None:
         """The address of a tensor; None and addresses as they are. Raises TypeError if the tensor has another dtype or
         device, or is not contiguous."""
-        if value is None or not isinstance(value, torch.Tensor):
+        if not isinstance(value, torch.Tensor):
             return value
-        fits = self.dtype is None or value.dtype is self.dtype
-        if not (fits and value.is_cpu and value.is_contiguous()):
+        if self.dtype not in (None, value.dtype) or not value.is_cpu or not value.is_contiguous():
             raise TypeError(
                 f"tensor of {value.dtype} on {value.device} with strides {value.stride()}; expected {self.dtype} on "
                 "the CPU, contiguous"
@@ -60,15 +59,14 @@ class Pointer:
         """What ctypes passes for an argument."""
         if value is None or isinstance(value, (int, torch.Tensor)):
             return ctypes.c_void_p(self.address(value))
-        return ctypes.byref(value) if isinstance(value, ctypes.Structure) else value
+        return ctypes.byref(value) if isinstance(value, Struct) else value
 
 
 class Struct(ctypes.Structure):
     """A struct of a C++ file. :meth:`fill` sets pointers to what :class:`Pointer` takes, and keeps tensors alive."""
 
     __slots__ = ("kept",)
-    members: ClassVar[dict[str, Pointer | None]] = {}
-    """The type of each field that is a pointer, None for others."""
+    pointers: ClassVar[dict[str, Pointer]] = {}
 
     def __init__(self, **values: Any):
         self.kept: dict[str, Any] = {}
@@ -78,22 +76,19 @@ class Struct(ctypes.Structure):
         """Set fields. Raises AttributeError if there is no such field, and TypeError if a value does not fit its
         type."""
         self.kept.update(values)
-        members = self.members
+        pointers = self.pointers
         for name, value in values.items():
-            pointer = members.get(name)
-            setattr(self, name, value if pointer is None else pointer.address(value))
+            setattr(self, name, pointers[name].address(value) if name in pointers else value)
 
 
 def structs_of(text: str) -> dict[str, type[Struct]]:
     """The structs that the text of a C++ file shares, by name. Raises ValueError if a field is of an unknown type."""
     found: dict[str, type[Struct]] = {}
     for name, body in re.findall(r"^struct (\w+) \{\n(.*?)^\};", _shared(text), re.M | re.S):
-        members, fields = {}, []
-        for statement in filter(None, map(str.strip, body.split(";"))):
-            for field, kind in _declared(statement, found):
-                members[field] = kind if isinstance(kind, Pointer) else None
-                fields.append((field, ctypes.c_void_p if isinstance(kind, Pointer) else kind))
-        found[name] = type(name, (Struct,), {"__slots__": (), "members": members, "_fields_": fields})
+        declared = [each for statement in body.split(";") if statement.strip() for each in _declared(statement, found)]
+        pointers = {field: kind for field, kind in declared if isinstance(kind, Pointer)}
+        fields = [(field, ctypes.c_void_p if field in pointers else kind) for field, kind in declared]
+        found[name] = type(name, (Struct,), {"__slots__": (), "pointers": pointers, "_fields_": fields})
     return found
 
 
@@ -102,30 +97,31 @@ def functions_of(text: str, structs: dict[str, type[Struct]]) -> dict[str, tuple
     its structs. Raises ValueError if a type is unknown."""
     found = {}
     for result, name, parameters in re.findall(r"^(\w+) (\w+)\(([^)]*)\) \{", _shared(text), re.M):
-        listed = [_declared(parameter, structs) for parameter in filter(None, parameters.split(","))]
-        found[name] = None if result == "void" else _NUMBERS[result][0], [kind for ((_, kind),) in map(list, listed)]
+        kinds = [kind for each in filter(None, parameters.split(",")) for _, kind in _declared(each, structs)]
+        found[name] = None if result == "void" else _NUMBERS[result][0], kinds
     return found
 
 
 def _shared(text: str) -> str:
     """What a C++ file shares, without comments."""
-    return "\n".join(
-        re.sub(r"//.*", "", part) for part in re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)
-    )
+    return re.sub(r"//.*", "", "\n".join(re.findall(r'^extern "C" \{\n(.*?)^\}  // extern "C"', text, re.M | re.S)))
 
 
-def _declared(statement: str, structs: dict[str, type[Struct]]) -> Iterator[tuple[str, Any]]:
+def _declared(statement: str, structs: dict[str, type[Struct]]) -> list[tuple[str, Any]]:
     """Names and types that a statement such as ``const float *a, b[3]`` declares; arrays are flat."""
-    matched = re.fullmatch(r"(?:const )?(\w+)\b(.*)", " ".join(statement.split()))
-    for declarator in matched[2].split(",") if matched else [""]:
-        parts = re.fullmatch(r" ?(\*?) ?(\w+)((?:\[\d+\])*)", declarator)
-        base = matched and ((structs.get(matched[1]), None) if matched[1] in structs else _NUMBERS.get(matched[1]))
-        if not parts or not base:
+    found: list[tuple[str, Any]] = []
+    base, declarators = re.sub(r"^\s*(const )?", "", statement).split(None, 1)
+    if base.endswith("*"):
+        base, declarators = base[:-1], f"*{declarators}"
+    number: Any
+    number, dtype = (structs[base], None) if base in structs else _NUMBERS.get(base, (None, None))
+    for declarator in declarators.split(","):
+        parts = re.fullmatch(r"\s*(\*?)\s*(\w+)((?:\[\d+\])*)\s*", declarator)
+        if not parts or number is None:
             raise ValueError(f"{statement!r}: not a declaration of numbers, arrays, pointers or structs")
-        kind: Any = Pointer(base[1]) if parts[1] else base[0]
-        if parts[3]:  # of several dimensions: all numbers in a row
-            kind = kind * math.prod(map(int, re.findall(r"\d+", parts[3])))
-        yield parts[2], kind
+        sizes = [int(size) for size in re.findall(r"\d+", parts[3])]
+        found.append((parts[2], Pointer(dtype) if parts[1] else number * math.prod(sizes) if sizes else number))
+    return found
 
 
 SEVERAL = 4000
@@ -189,15 +185,25 @@ def _why_not_loaded() -> str:
 
 
 class Kernels:
-    """Functions of a C++ file that are faster than torch, for a feature that warnings name by ``what``.
+    """Functions of a C++ file, or of those in a folder, that are faster than torch, for a feature that warnings name by
+    ``what``.
 
-    What the file declares is what Python calls. ``agree`` tells whether the functions do what torch does, on a small
-    input, so that no miscompilation passes; it may call them. All are used together or not at all.
+    What the files declare is what Python calls. ``agree``, which may be given later by :meth:`tried_by`, tells whether
+    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them. All are used
+    together or not at all.
     """
 
-    def __init__(self, what: str, source: Path, agree: Callable[[], bool]):
-        self.what, self.source, self._agree = what, source, agree
+    def __init__(self, what: str, source: Path, agree: Callable[[], bool] | None = None):
+        self.what, self.source = what, source
+        self.files = sorted(source.glob("*.cpp")) if source.is_dir() else [source]
+        if agree is not None:
+            self.tried_by(agree)
+
+    def tried_by(self, agree: Callable[[], bool]) -> Callable[[], bool]:
+        """Set the function that tells whether the kernels do what torch does."""
+        self._agree = agree
         _TRIAL.members.append(self)
+        return agree
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
@@ -206,10 +212,9 @@ class Kernels:
 
     @functools.cached_property
     def _text(self) -> str:
-        """The text of the file, after those of the headers beside it that it includes."""
-        text = self.source.read_text("utf-8")
-        headers = [self.source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
-        return "".join([*(header.read_text("utf-8") for header in headers if header.is_file()), text])
+        """The text of the headers beside the files, and of these."""
+        headers = self.files[0].parent.glob("*.h")
+        return "".join(path.read_text("utf-8") for path in (*sorted(headers), *self.files))
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:

@@ -48,6 +48,16 @@ def parse_megabytes(text: str) -> float:
     return parse_number(text[:-1]) / 1e6 if text.lower().endswith("b") else parse_number(text)
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things.
+
+    Example:
+        >>> counted(1, "size"), counted(2000, "point")
+        ('1 size', '2,000 points')
+    """
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
 def seconds_text(seconds: float) -> str:
     """A duration with the digits that matter.
 

@@ -1,207 +1,161 @@
-"""Makes the scene of a setting like its command, judges it and times it."""
+"""Measures one point: compares a smaller scene with the dense scene and with photos, and times its frames.
+
+On a shared machine the time of a frame may double within a minute. So each frame is timed beside a frame of the dense
+scene in the same view: both slow down alike, and the ratio of their times stays.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-import shlex
-import tempfile
+import platform
+import re
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
-from pointsplat_ns.compression.compact import compact_scene, rounding_stage
-from pointsplat_ns.compression.compacted import Compacted
-from pointsplat_ns.compression.photo_repair import Photos
-from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
-from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
+from pointsplat_ns.compression.compact import rounding_stage
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import usable_part
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
+from pointsplat_ns.looking.closeness import DenseReference, views_text
+from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import middle_sized
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pruning import cut_sh, need_usable, ply_bytes
-from pointsplat_ns.system.memory import PeakMemory
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
+from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
+from pointsplat_ns.pruning import cut_sh, need_usable
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.tradeoff.judging import Judge, Judged, JudgedViews
-from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import DENSE, EFFORTS, Setting, whole_of
-from pointsplat_ns.views import Views
+from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.tradeoff.making import MadeScene, Subject, make, through_file
+from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting
+from pointsplat_ns.views import View, Views
 
-HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
-"""From a number to at most that many views of held-out photos, and the photos (H, W, 3)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """The scene of a measurement."""
-
-    dense: Gaussians
-    path: Path
-    """Path of the scene in commands."""
-    name: str
-    """Name of the scene in files of commands."""
-    new_views: Callable[[], ViewSource]
-    """Makes a new source of its views, the same as for its commands."""
-    held_out: HeldOut | None = None
-    """Its held-out photos; None if it cannot have any."""
-    refiner: TrainedRefiner | None = None
-    """The refiner before repairs. None is no refiner, but the shipped one for the repair ``refiner``."""
-    suffix: str = ".ply"
-    """Suffix of the format of smaller scenes."""
-    words: tuple[str, ...] = ()
-    """Options of its commands on views, such as ``--poses FILE``."""
-    resolution: tuple[int, int] | None = None
-    """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
-    training: Photos | None = None
-    """Its training photos, for the repair ``photos``."""
-
-    def names(self, setting: Setting) -> dict[str, str]:
-        """The key, the label and the command of a setting's point. The command has the count, because percentages are
-        rounded."""
-        if setting.by == DENSE:
-            return {"key": DENSE, "label": DENSE, "command": ""}
-        percent, cut = 100 * setting.count / len(self.dense), setting.sh_degree != self.dense.sh_degree
-        merged, repaired = setting.by == "merge", setting.repair != "none"
-        keys = [f"{percent:.4g}pct", f"sh{setting.sh_degree}"]
-        keys += [setting.repair] * repaired + [setting.by] * (not merged)
-        labels = [f"{percent:.3g} %" + ("" if merged else f" by {setting.by}")]
-        labels += [f"SH degree {setting.sh_degree}"] * cut
-        named = {"none": [], "refiner": ["refined"], "photos": ["trained on photos"]}
-        labels += named.get(setting.repair, [f"repaired ({setting.repair})"])
-        words = ["pointsplat", "compact" if repaired else "prune", str(self.path), "--keep", str(setting.count)]
-        words += [*self.words, *(["--by", setting.by] if repaired or not merged else [])]
-        words += ["--sh", str(setting.sh_degree)] if cut else []
-        words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
-        words += ["--effort", EFFORTS[setting.repair]] if repaired else []
-        words += ["--photos"] if setting.repair == "photos" else []
-        key = "_".join(keys)
-        command = shlex.join([*words, "-o", f"{self.name}_{key}.ply"])
-        return {"key": key, "label": ", ".join(labels), "command": command}
+ROUNDS = 3
+"""Number of timed frames of each view, alternating between the dense scene and the measured scene."""
 
 
-@dataclass(frozen=True, eq=False)
-class MadeScene:
-    """A smaller scene, and the cost of making it."""
+class JudgedViews(NamedTuple):
+    """The views that scenes are judged in."""
 
-    scene: Gaussians
-    seconds: float
-    peak_bytes: int | None
-    """Peak memory of this process while making it."""
-    notes: tuple[str, ...] = ()
-    """Lines of text, as of :class:`~pointsplat_ns.compression.prune.Pruned`."""
-    compacted: Compacted | None = None
-    """The whole result for a repaired scene; None for others."""
+    views: Views
+    photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
+    origin: str
+    """Text on the origin of the views."""
 
-
-def make(
-    dense: Gaussians,
-    setting: Setting,
-    new_views: Callable[[], ViewSource],
-    progress: Progress,
-    refiner: TrainedRefiner | None = None,
-    training: Photos | None = None,
-) -> MadeScene:
-    """Make the scene of a setting. ``new_views`` makes a source of views; it is called once, so that time and result
-    equal the command's. ``refiner`` and ``training`` are as for :class:`Subject`. Raises KeyboardInterrupt on Ctrl-C,
-    also during a repair."""
-    peak, start = PeakMemory(), time.perf_counter()
-    sh = str(setting.sh_degree) if setting.sh_degree < dense.sh_degree else "all"
-    compacted = None
-    if setting.repair == "none":
-        pruned = prune_scene(dense, PruneRequest(setting.count, setting.by, sh), new_views(), progress)
-        scene, notes = pruned.scene, pruned.notes
-    else:
-        if setting.repair == "refiner":
-            refiner = refiner or load_refiner()
-        budget, on_photos = RepairBudget(EFFORTS[setting.repair]), setting.repair == "photos"
-        request = CompactRequest.of(refiner, setting.count, setting.by, sh, repair=budget, photos=on_photos)
-        compacted = compact_scene(dense, request, new_views(), progress, training)
-        if compacted.interrupted:
-            raise KeyboardInterrupt
-        scene, notes = compacted.scene, compacted.notes
-    return MadeScene(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)
-
-
-def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing and reading: exact
-    for a PLY, with fewer bits for other formats. Formats without a reader, such as ``.glb``, return ``scene``."""
-    kind = format_to_write(suffix)
-    if kind.suffix == ".ply":
-        return ply_bytes(len(scene), scene.sh_degree), scene
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"scene{suffix}"
-        assert kind.write is not None
-        # Without the warning of losses, which is for the scene that is kept.
-        kind.write(usable_part(scene.detach().to("cpu", torch.float32)), path, silent)
-        return path.stat().st_size, scene if kind.read is None else kind.read(path).to(scene.device)
+    @property
+    def where(self) -> str:
+        """Text: the number of views, and their width."""
+        of = "" if self.photos is None else " of held-out photos"
+        return f"{views_text(len(self.views))}{of}, {self.views.width} pixels wide"
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     """At most ``count`` views to judge scenes in, of the size of comparisons in ``compact``, and a note. They are the
-    views of held-out photos, or else the views of comparisons in ``compact``, which no repair uses. Raises DataError if
-    there are none."""
+    views of held-out photos, which are averaged over the areas of pixels, or else the views of comparisons in
+    ``compact``, which no repair uses. Raises DataError if there are none."""
     note = ""
     if subject.held_out is not None:
         try:
             views, photos = subject.held_out(count)
             whole = views if subject.resolution is None else views.resized(max(subject.resolution))
             middle = middle_sized(whole)
-            photographed = JudgedViews(views, photos, "held-out photos of the dataset")
-            return photographed.resized(max(middle.width, middle.height)), ""
+            small = views.resized(max(middle.width, middle.height))
+            if small is not views:
+                photos = [_averaged(photo, small.height, small.width) for photo in photos]
+            return JudgedViews(small, photos, "held-out photos of the dataset"), ""
         except (SceneError, DataError) as error:
             note = f"there are no held-out photos: {error}"
-    return JudgedViews.compared(subject.new_views(), count), note
+    source = subject.new_views()
+    return JudgedViews(source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin), note
+
+
+def _averaged(photo: Tensor, height: int, width: int) -> Tensor:
+    small = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], (height, width), mode="area")
+    return small[0].permute(1, 2, 0)
 
 
 class Measurer:
-    """Makes scenes of settings and measures them in at most ``views`` views. Without ``timed``, times are NaN. Raises
-    SceneError if no Gaussian can be drawn, and DataError if there are no views."""
+    """Makes scenes of settings, and measures them in the same views against the same pictures: the dense scene's
+    renders, and photos if there are some.
+
+    Args:
+        subject: the scene.
+        views: largest number of views.
+        progress: called with the task and its share done.
+        timed: whether frames are timed; if not, times are NaN.
+
+    Raises:
+        SceneError: if no Gaussian can be drawn.
+        DataError: if there are no views, or they are too small for SSIM.
+    """
 
     def __init__(self, subject: Subject, views: int, progress: Progress, timed: bool = True):
         need_usable(subject.dense)
         self.subject, self.dense, self.timed = subject, subject.dense, timed
         self.dense_ms: float | None = None
-        """Time of a frame of the dense scene from an earlier measurement; set before the first judgement."""
+        """Time of a frame of the dense scene, the unit of measured ratios; by default measured with the first scene."""
         self.notes: dict[str, None] = {}
         self._kept: dict[Setting, MadeScene] = {}
         progress("looking for views", 0.0)
         self.judged_views, note = views_to_judge(subject, views)
         self.note(note)
+        shown = self.judged_views.views
+        if min(shown.width, shown.height) < SSIM_WINDOW:
+            raise DataError(f"views are {shown.width} x {shown.height} pixels; expected at least {SSIM_WINDOW} a side")
 
     def note(self, text: str) -> None:
         """Keep a line of text for the reader, once, unless it is empty."""
         if text:
             self.notes[text] = None
 
-    @cached_property
-    def judge(self) -> Judge:
-        """The judge of all scenes."""
-        judge = Judge(self.dense, self.judged_views, self.dense_ms)
-        self.note(judge.no_lpips)
-        return judge
+    @functools.cached_property
+    def reference(self) -> DenseReference:
+        """Renders of the dense scene."""
+        return DenseReference(self.dense, self.judged_views.views)
+
+    @functools.cached_property
+    def lpips(self) -> Lpips | None:
+        """LPIPS for pictures of this size; None without its weights, with a note. Nothing is downloaded."""
+        image = self.reference.renders[0]
+        try:
+            lpips = load_lpips("alex", download=False).to(image.device)
+            lpips(image, image)
+            return lpips
+        except LpipsUnavailable:  # its text names folders, which the page must not show
+            self.note("LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS")
+        except ImageError as error:  # an image too small for the network
+            self.note(f"LPIPS is missing: {error}")
+        return None
+
+    @torch.no_grad()
+    def psnr(self, scene: Gaussians) -> float:
+        """PSNR of a scene against the dense scene's renders, over the pixels that the dense scene covers, dB."""
+        return min(self.reference.psnr(scene)[0], MOST_PSNR)
 
     def cut_psnr(self, degree: int) -> float:
         """PSNR in dB of the dense scene's renders without the SH bands above a degree, against all bands."""
-        return self.judge.psnr(cut_sh(self.dense, degree))
+        return self.psnr(cut_sh(self.dense, degree))
 
     def measure_dense(self, show: Progress) -> Point:
         """The dense scene's point; ``show`` as for :meth:`measure`."""
-        point = self._point(whole_of(self.dense, DENSE), MadeScene(self.dense, 0.0, None), show)
+        setting = Setting(len(self.dense), self.dense.sh_degree, by=DENSE)
+        point = self._point(setting, MadeScene(self.dense, 0.0, None), show)
         return replace(point, against_dense=replace(point.against_dense, psnr=math.inf))
 
     def measure(self, setting: Setting, show: Progress) -> Point:
-        """The point of a setting. ``show`` is called with the name of the current task (empty during the judgement) and
-        its share done."""
+        """The point of a setting. ``show`` is called with the name of the current task and its share done."""
         return self._point(setting, self.made(setting, show), show)
 
     def made(self, setting: Setting, show: Progress = silent) -> MadeScene:
@@ -217,7 +171,7 @@ class Measurer:
     def _rounded(self, made: MadeScene) -> MadeScene:
         """The scene of a compressed file: its numbers are rounded as far as its error allows, as by ``--keep auto``."""
         kind = format_to_write(self.subject.suffix)
-        if kind.rounded is None or (psnr := self.judge.psnr(made.scene)) > ROUNDING.best_psnr:
+        if kind.rounded is None or (psnr := self.psnr(made.scene)) > ROUNDING.best_psnr:
             return made
         limit, compacted = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree)), made.compacted
         if compacted is None:
@@ -229,14 +183,89 @@ class Measurer:
 
     def _point(self, setting: Setting, made: MadeScene, show: Progress) -> Point:
         size, scene = through_file(made.scene, self.subject.suffix)
-        judged = self.judge.judge(scene, lambda done: show("", done), self.timed)
-        figures = {"by": setting.by, "share": setting.count / len(self.dense), "repair": setting.repair, "bytes": size}
-        return point_of(made, judged, **self.subject.names(setting), **figures)
+        return Point(
+            **self.subject.names(setting), by=setting.by, share=setting.count / len(self.dense),
+            gaussians=len(made.scene), sh_degree=made.scene.sh_degree, repair=setting.repair, bytes=size,
+            **self._compared(scene, lambda done: show("comparing", done)),
+            **self._times(scene, lambda done: show("timing frames", done)),
+            seconds=made.seconds, peak_bytes=made.peak_bytes,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def _compared(self, scene: Gaussians, progress: Callable[[float], None]) -> dict[str, Any]:
+        """The figures of a point that are seen in its renders."""
+        (views, photos, _), images, against_photos = self.judged_views, [], None
+        for view in views:
+            images.append(render(scene, view))
+            progress(len(images) / len(views))
+        if photos is not None:
+            pairs = [(image, photo.to(image)) for image, photo in zip(images, photos, strict=True)]
+            psnr, similarity = (fmean(float(metric(*pair)) for pair in pairs) for metric in (finite_psnr, ssim))
+            against_photos = ImageMetrics(psnr, similarity, self._perceived(pairs))
+        close = self.reference.closeness_of(images)
+        assert close.ssim is not None
+        perceived = self._perceived(zip(images, self.reference.renders, strict=True))
+        against_dense = ImageMetrics(min(close.psnr, MOST_PSNR), close.ssim, perceived)
+        return {"against_dense": against_dense, "against_photos": against_photos, "fill": fill(scene, views)}
+
+    def _perceived(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> float | None:
+        """Mean LPIPS over pairs of pictures; None without its weights."""
+        return None if self.lpips is None else fmean(float(self.lpips(*pair)) for pair in pairs)
+
+    @torch.no_grad()
+    def _times(self, scene: Gaussians, progress: Callable[[float], None]) -> dict[str, Any]:
+        """The times of a point: ``dense_ms`` times the measured ratio of frames."""
+        names, views = ("frame_ms_low", "frame_ms", "frame_ms_high"), self.judged_views.views
+        if not self.timed:
+            return dict.fromkeys(names, math.nan)
+        others, pairs = OtherPrograms(), []
+        with fixed_threads(torch.get_num_threads()):  # the same number for all frames
+            for _ in range(ROUNDS):
+                for view in views:
+                    pairs.append((_timed(self.dense, view), _timed(scene, view)))
+                    progress(len(pairs) / (ROUNDS * len(views)))
+        rounds = np.array(pairs).reshape(ROUNDS, len(views), 2)  # seconds
+        if self.dense_ms is None:
+            self.dense_ms = 1000 * float(np.median(rounds[..., 0].min(axis=0)))
+        shares = np.median(rounds[..., 1] / rounds[..., 0], axis=0)  # of each view
+        quartiles = np.quantile(shares, (0.25, 0.5, 0.75))
+        unit = self.dense_ms / (quartiles[1] if scene is self.dense else 1.0)  # the dense scene is as fast as itself
+        times = {name: float(share * unit) for name, share in zip(names, quartiles, strict=True)}
+        return {**times, "others_cores": others.cores()}
 
 
-def point_of(made: MadeScene, judged: Judged, **named: Any) -> Point:
-    """The point of a made and judged scene; ``named`` are the other fields of :class:`Point`."""
-    return Point(
-        gaussians=len(made.scene), sh_degree=made.scene.sh_degree, seconds=made.seconds, peak_bytes=made.peak_bytes,
-        **vars(judged), **named,
-    )  # fmt: skip
+def _timed(scene: Gaussians, view: View) -> float:
+    """Seconds of drawing a view."""
+    _wait_for(scene.device)
+    start = time.perf_counter()
+    render(scene, view)
+    _wait_for(scene.device)
+    return time.perf_counter() - start
+
+
+def _wait_for(device: torch.device) -> None:
+    """Wait until a GPU is idle."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def machine_text(device: torch.device) -> str:
+    """Processor, number of threads, device and version of torch, as text."""
+    threads, about = torch.get_num_threads(), Path("/proc/cpuinfo")  # of Linux
+    models = re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M) if about.exists() else []
+    processor = next(iter(models), "") or platform.processor() or platform.machine()
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}, {where}, torch {torch.__version__}"
+
+
+def busy_note(others: Sequence[float | None]) -> str:
+    """A line of text if other programs disturbed measurements, from the cores that they used during each, which are
+    None where nothing was timed; else empty. A quarter of a core does not change medians."""
+    timed = [used for used in others if used is not None]
+    disturbed = [used for used in timed if used + torch.get_num_threads() > cores() + 0.25]
+    if not disturbed:
+        return ""
+    return (
+        f"the machine was busy: while {len(disturbed)} of {len(timed)} points were timed, other programs took up "
+        f"to {max(disturbed):.1f} of {cores()} cores; times are not to be trusted"
+    )

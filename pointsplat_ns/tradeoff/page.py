@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,14 @@ from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.tradeoff.front import Cost, Metric, Reference, fastest_first, metric_of, pareto_front, psnr_within
 from pointsplat_ns.tradeoff.points import Point, Tradeoff, picture_path, speed_of
+from pointsplat_ns.tradeoff.recommend import fastest_first, psnr_within
 
 FLIGHT_BYTES = 4_000_000
 """Largest size of a page's scenes in bytes; the rest of the page is for its pictures."""
 
-REFERENCES: tuple[Reference, ...] = get_args(Reference)
-METRICS: tuple[Metric, ...] = get_args(Metric)
-COSTS: tuple[Cost, ...] = get_args(Cost)
+REFERENCES = ("renders", "photos")
+METRICS = ("psnr", "ssim", "lpips")
 
 
 def write_sweep_page(
@@ -115,7 +114,7 @@ def _pictures(sweep: Tradeoff, folder: Path) -> list[dict[str, Callable[[], np.n
 def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
     """Values for the template itself, without scripts."""
 
-    def measured(reference: Reference, metric: Metric) -> bool:
+    def measured(reference: str, metric: str) -> bool:
         return any(metric_of(point, reference, metric) is not None for point in sweep.points)
 
     return {
@@ -137,30 +136,29 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
 def _data(sweep: Tradeoff) -> dict[str, Any]:
     """Data for the scripts, except pictures. An infinite number is the text "Infinity"."""
 
-    def qualities(point: Point, reference: Reference) -> dict[str, float | str | None]:
+    def qualities(point: Point, reference: str) -> dict[str, float | str | None]:
         values = {metric: metric_of(point, reference, metric) for metric in METRICS}
         return {metric: "Infinity" if value == math.inf else value for metric, value in values.items()}
 
-    def fronts(reference: Reference, metric: Metric) -> dict[str, list[str]]:
-        return {cost: [p.key for p in pareto_front(sweep.points, cost, reference, metric)] for cost in COSTS}
-
+    same = ("key", "label", "command", "frame_ms", "frame_ms_low", "frame_ms_high", "gaussians", "bytes")
     return {
         "points": [
             {
-                "key": point.key,
-                "label": point.label,
-                "command": point.command,
                 "group": _group(point),
-                "low": point.frame_ms_low,
-                "high": point.frame_ms_high,
-                **{cost: getattr(point, cost) for cost in COSTS},
+                **{name: getattr(point, name) for name in same},
                 **{reference: qualities(point, reference) for reference in REFERENCES},
             }
             for point in sweep.points
         ],
-        "fronts": {reference: {metric: fronts(reference, metric) for metric in METRICS} for reference in REFERENCES},
         "fastest": [point.key for point in fastest_first(sweep.points, sweep.times_trusted)],
+        "found": sweep.recommended if sweep.target else None,
     }
+
+
+def metric_of(point: Point, reference: str, metric: str) -> float | None:
+    """A metric of a point against one of :data:`REFERENCES`; None where it was not measured. A PSNR may be infinite."""
+    quality = point.against_dense if reference == "renders" else point.against_photos
+    return None if quality is None else getattr(quality, metric)
 
 
 def _group(point: Point) -> str:

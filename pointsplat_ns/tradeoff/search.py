@@ -8,18 +8,99 @@ way within the limits.
 
 from __future__ import annotations
 
+import functools
 import math
+import time
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pointsplat_ns.compression.budget_search import BUDGETS, find_count
+from pointsplat_ns.compression.budget_search import FIRST_SHARE, find_count, find_size
+from pointsplat_ns.compression.compact import as_compacted
+from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.pruning import ply_bytes, resolve_keep
-from pointsplat_ns.tradeoff.points import Point
-from pointsplat_ns.tradeoff.settings import Repair, Setting
-from pointsplat_ns.tradeoff.targets import Targets
+from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.metrics import MOST_PSNR
+from pointsplat_ns.pruning import cut_sh, ply_bytes, resolve_keep
+from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.quantities import counted
+from pointsplat_ns.tradeoff.making import Subject, through_file
+from pointsplat_ns.tradeoff.measuring import Measurer, busy_note
+from pointsplat_ns.tradeoff.points import Point, Repair, Setting
+
+PRECISION = 1.1
+"""Largest ratio of a count that meets a target to the next one that misses it: coarse, because each try makes, repairs
+and renders a scene."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Targets of a scene. Raises BudgetError if there is no target, or one is not a positive number or above what
+    differs from no error."""
+
+    db: float | None = None
+    """Least PSNR against the dense scene's renders, over the pixels that it covers, dB."""
+    ms: float | None = None
+    """Longest time of a frame, milliseconds."""
+    mb: float | None = None
+    """Largest file, in units of 10^6 bytes."""
+
+    def __post_init__(self) -> None:
+        given = {"--target-db": self.db, "--target-ms": self.ms, "--target-mb": self.mb}
+        for name, value in given.items():
+            if value is not None and not 0 < value < math.inf:
+                raise BudgetError(f"{name} is {value:g}; expected a positive number")
+        if self.db is not None and self.db > MOST_PSNR:
+            raise BudgetError(
+                f"--target-db is {self.db:g}; no smaller scene reaches it, expected at most {MOST_PSNR:g}"
+            )
+        if all(value is None for value in given.values()):
+            raise BudgetError(f"no target is given; expected one of {', '.join(given)}")
+
+    def __str__(self) -> str:
+        limits = [] if self.db is None else [f"at least {self.db:g} dB"]
+        limits += [] if self.ms is None else [f"at most {self.ms:g} ms a frame"]
+        limits += [] if self.mb is None else [f"at most {bytes_text(1e6 * self.mb)}"]
+        return ", ".join(limits)
+
+    def missed(self, point: Point) -> list[str]:
+        """Text on each target that a point misses; empty if it meets all."""
+        words = []
+        if self.db is not None and point.against_dense.psnr < self.db:
+            words.append(f"{point.against_dense.psnr:.2f} dB, less than {self.db:g} dB")
+        if self.ms is not None and point.frame_ms > self.ms:
+            words.append(f"{point.frame_ms:.3g} ms a frame, more than {self.ms:g} ms")
+        if self.mb is not None and point.bytes > 1e6 * self.mb:
+            words.append(f"{bytes_text(point.bytes)}, more than {bytes_text(1e6 * self.mb)}")
+        return words
+
+
+def targets_of(
+    db: float | None,
+    ms: float | None,
+    mb: float | None,
+    keep: object = None,
+    sh: str = "all",
+    clean: bool = False,
+    seconds: float | None = None,
+    photos: bool = False,
+) -> Targets | None:
+    """Targets from options that may be missing; None if all are missing. Raises BudgetError if a target is invalid, or
+    ``photos`` or an option that the search decides (keep, sh, clean, seconds) is given with a target."""
+    if db is ms is mb is None:
+        return None
+    if photos:
+        raise BudgetError("a search for targets renders the dense scene alone; expected targets or photos, not both")
+    decided = {"keep": keep is not None, "sh": sh != "all", "clean": clean, "seconds": seconds is not None}
+    names = [name for name, given in decided.items() if given]
+    if names:
+        raise BudgetError(
+            f"{', '.join(names)} cannot be given with a target: how many Gaussians and SH bands are kept, and how they "
+            "are repaired, is decided by what the scene needs"
+        )
+    return Targets(db, ms, mb)
 
 
 @dataclass(frozen=True)
@@ -29,6 +110,11 @@ class Found:
     setting: Setting
     point: Point
     why: str
+
+
+def psnr_text(psnr: float) -> str:
+    """A PSNR against a reference, dB, of pictures of 256 levels or more."""
+    return f"{psnr:.2f} dB against" if psnr < MOST_PSNR else "no difference from"
 
 
 class TargetSearch:
@@ -122,10 +208,8 @@ class TargetSearch:
         most = self.whole.count if self._best is None else self._most(way, self._point(self._best).bytes)
         if most < 1:
             return None
-        first = most if most < self.whole.count else resolve_keep(self.whole.count, BUDGETS.first_share)
-        found = find_count(
-            psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, settings=BUDGETS.repaired
-        )
+        first = most if most < self.whole.count else resolve_keep(self.whole.count, FIRST_SHARE)
+        found = find_count(psnr, wanted, at_least=True, first=first, most=most, slope=self._slope, precision=PRECISION)
         if found.count is None:
             return None
         self._slope = found.slope
@@ -140,7 +224,7 @@ class TargetSearch:
         least = min(count, max(1, round(1e-3 * self.whole.count)))  # fewer draw almost nothing
         found = find_count(
             lambda count: math.log(self._point(replace(way, count=count)).frame_ms), math.log(limit), at_least=False,
-            first=count, most=count, least=least, slope=1.0, settings=BUDGETS.repaired,
+            first=count, most=count, least=least, slope=1.0, precision=PRECISION,
         )  # fmt: skip
         if found.count is None:
             point = self._point(replace(way, count=least))
@@ -156,16 +240,16 @@ class TargetSearch:
         if self.targets.mb is None:
             return self.whole.count
         limit = math.floor(1e6 * self.targets.mb)
-        found = find_count(
-            lambda count: math.log(self._point(replace(way, count=count)).bytes), math.log(max(limit, 1)),
-            at_least=False, first=self._most(way, limit + 1), most=self.whole.count, slope=1.0, settings=BUDGETS.size,
+        count = find_size(
+            lambda count: self._point(replace(way, count=count)).bytes, limit, self._most(way, limit + 1),
+            self.whole.count,
         )  # fmt: skip
-        if found.count is None:
+        if count is None:
             raise BudgetError(
                 f"--target-mb is {limit / 1e6:g}, too small for one Gaussian of SH degree {way.sh_degree}; expected at "
                 f"least {self._size(1, way.sh_degree) / 1e6:g}"
             )
-        return found.count
+        return count
 
     def _most(self, way: Setting, size: int) -> int:
         """The largest count of a way with an expected file below ``size`` bytes; 0 if there is none."""
@@ -176,14 +260,14 @@ class TargetSearch:
         point = self._point(setting)
         time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
         why = (
-            f"{point.label}: {point.against_dense.psnr:.2f} dB against the dense scene's renders in {self.where}, "
-            f"{time}{bytes_text(point.bytes)}, {point.gaussians:,} Gaussians; {len(self.tried)} scenes tried"
+            f"{point.label}: {psnr_text(point.against_dense.psnr)} the dense scene's renders in {self.where}, "
+            f"{time}{bytes_text(point.bytes)}, {point.gaussians:,} Gaussians; {counted(len(self.tried), 'scene')} tried"
         )
         cheaper = [s for s, p in self.tried.items() if self.targets.missed(p) and self._cost(s) < self._cost(setting)]
         if cheaper:
             other = self.tried[max(cheaper, key=lambda s: (self._cost(s), self.tried[s].against_dense.psnr))]
             word = "better" if self.targets.db is None else "cheaper"
-            why += f"; the next {word}, {other.label}, has {', '.join(self.targets.missed(other))}"
+            why += f"; the next {word}, {other.label}, has {' and '.join(self.targets.missed(other))}"
         return Found(setting, point, why)
 
     def _obstacle(self, wanted: float) -> str:
@@ -192,8 +276,71 @@ class TargetSearch:
         reaching = [point for point in tried if point.against_dense.psnr >= wanted]
         if reaching:
             point = min(reaching, key=lambda point: point.bytes)
-            missed = ", ".join(self.targets.missed(point))
+            missed = " and ".join(self.targets.missed(point))
             return f"no scene meets all targets: the smallest that reaches {wanted:g} dB ({point.label}) has {missed}"
         best = max(tried, key=lambda point: point.against_dense.psnr)
         psnr = f"{best.against_dense.psnr:.2f} dB in {self.where} ({best.label})"
         return f"no scene reaches --target-db {wanted:g} in this format: the best tried has {psnr}"
+
+
+def find_scene(
+    subject: Subject, targets: Targets, by: str, repairs: tuple[Repair, ...], progress: Progress
+) -> Compacted:
+    """Find the cheapest scene that meets targets by :class:`TargetSearch`, with a method of pruning and the repairs to
+    try, without a folder of measurements: ``compact --target-db``.
+
+    Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
+    reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the
+    cheapest scene found so far.
+
+    Raises:
+        BudgetError: if no scene meets all targets; the text tells the reachable values.
+        SceneError: if no Gaussian can be drawn.
+        DataError: if there are no views.
+        KeyboardInterrupt: on an interruption before any scene meets all targets.
+    """
+    start = time.perf_counter()
+    dense, timed = subject.dense, targets.ms is not None
+    measurer = Measurer(subject, VIEW_COUNTS.compared, progress, timed=timed)
+
+    def measure(setting: Setting) -> Point:
+        number = 1 + len(search.tried)
+        return measurer.measure(setting, lambda what, share: progress(f"scene {number}: {what}", share))
+
+    kind = format_to_write(subject.suffix)
+    size, bytes_of = _estimated(subject), kind.bytes_of
+    if bytes_of is not None:
+        size = lambda count, degree: bytes_of(count, degree, dense.traits)  # noqa: E731
+    where, exact = measurer.judged_views.where, kind.suffix == ".ply"
+    search = TargetSearch(
+        targets, Setting(len(dense), dense.sh_degree, by=by), repairs, measure, measurer.cut_psnr, where, size, exact
+    )
+    interrupted = False
+    try:
+        if timed:
+            measurer.measure_dense(lambda what, share: progress(f"dense scene: {what}", share))
+        found = search.run()
+    except KeyboardInterrupt:
+        so_far, interrupted = search.so_far(), True
+        if so_far is None:
+            raise
+        found = so_far
+    if timed:
+        measurer.note(busy_note([point.others_cores for point in search.tried.values()]))
+    made = measurer.made(found.setting, progress)
+    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
+    notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
+    seconds, why = time.perf_counter() - start, found.why
+    if measurer.judged_views.photos is not None and compacted.last.after is not None and len(compacted.stages) > 1:
+        why += f"; a repair is accepted in {compacted.last.after.where} of the photos that were trained on"
+    return replace(compacted, target=why, interrupted=interrupted, notes=notes, seconds=seconds)
+
+
+def _estimated(subject: Subject) -> Callable[[int, int], int]:
+    """Estimate of a file's size in bytes by count and SH degree, from the mean bytes of the dense scene's Gaussians."""
+
+    @functools.cache
+    def whole(degree: int) -> int:
+        return through_file(cut_sh(subject.dense, degree), subject.suffix)[0]
+
+    return lambda count, degree: max(1, whole(degree) * count // len(subject.dense))

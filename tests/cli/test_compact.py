@@ -146,7 +146,7 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
         (ply, ("--refiner", tmp_path / "gone.safetensors"), "no such file"),
         (ply, ("--refiner", tmp_path / "flat.safetensors"), "SH degree 1; the refiner"),
         (tmp_path / "gone.ply", ("--refiner", helps), "gone.ply: no such file"),
-        (tmp_path / "gone.ply", ("--seconds", "-1"), "the time to repair is -1 s; expected 0 or more"),
+        (ply, ("--seconds", "-1"), "the time to repair is -1 s; expected 0 or more"),
         (ply, ("--keep", "half"), "keep is 'half'"),
         (ply, ("--by", "best"), f"expected one of {', '.join(METHODS)}"),
         (ply, ("--picture", shown.with_suffix(".jpg")), "ends in .png"),

@@ -47,7 +47,7 @@ def raising(error: BaseException):
 def test_an_error_of_the_system_is_one_line_and_status_1(fail, said, monkeypatch, capsys):
     monkeypatch.setattr("pointsplat_ns.info", fail)
     with pytest.raises(SystemExit) as end:
-        main(["info", "a.ply"])
+        main(["info", __file__])
     assert end.value.code == 1
     errors = capsys.readouterr().err
     assert errors.startswith(f"error: {said}") and errors.count("\n") == 1
@@ -56,7 +56,7 @@ def test_an_error_of_the_system_is_one_line_and_status_1(fail, said, monkeypatch
 def test_a_bug_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("pointsplat_ns.info", raising(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
-        main(["info", "a.ply"])
+        main(["info", __file__])
 
 
 def test_the_version_is_printed(capsys):

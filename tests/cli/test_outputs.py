@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,29 +16,30 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.io.outputs import claimed, claimed_folder
 
 FILES = (
-    "prune gone.ply -o OUT.ply",
-    "prune gone.ply -o a.ply --plot OUT.png",
-    "compact gone.ply -o OUT.spz",
-    "compact gone.ply -o a.ply --picture OUT.png",
-    "compact gone.ply --dry-run --html OUT.html",
-    "convert gone.ply OUT.sog",
-    "export gone -o OUT.splat",
-    "info gone.ply --views OUT.png",
-    "render gone.ply -o OUT.mp4",
+    "prune damaged.ply -o OUT.ply",
+    "prune damaged.ply -o a.ply --plot OUT.png",
+    "compact damaged.ply -o OUT.spz",
+    "compact damaged.ply -o a.ply --picture OUT.png",
+    "compact damaged.ply --dry-run --html OUT.html",
+    "convert damaged.ply OUT.sog",
+    "export damaged.ply -o OUT.splat",
+    "info damaged.ply --views OUT.png",
+    "render damaged.ply -o OUT.mp4",
 )
 
 FOLDERS = (
-    "lod gone.ply -o OUT",
-    "tradeoff gone.ply -o OUT",
-    "render gone.ply -o OUT",
+    "lod damaged.ply -o OUT",
+    "tradeoff damaged.ply -o OUT",
+    "render damaged.ply -o OUT",
     "demo --output OUT",
 )
-"""Commands that fail at their work, because there is no such scene, unless they find before that they cannot write."""
+"""Commands that fail at their work, because the scene is damaged, unless they find before that they cannot write."""
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    Path("damaged.ply").write_text("ply")
     return tmp_path
 
 
@@ -99,7 +99,7 @@ def test_a_file_that_appears_during_the_work_is_replaced_by_force_alone(links, m
     monkeypatch.setattr(compacting, "prune_source", prune)
     main(words.split())
     assert len(ps.load("small.ply")) == 20
-    assert sorted(path.name for path in Path.cwd().iterdir()) == ["room.ply", "small.ply"]
+    assert sorted(path.name for path in Path.cwd().iterdir()) == ["damaged.ply", "room.ply", "small.ply"]
 
 
 @pytest.mark.parametrize(
@@ -123,15 +123,6 @@ def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words
     assert said.endswith("; the scene was written before, to small.ply") != dry
 
 
-HEEDED = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-signal.signal(signal.SIGHUP, signal.SIG_DFL)
-"""
-"""Where the tests run in the background of a shell or by nohup, SIGINT or SIGHUP is ignored, also by what they start,
-unless told otherwise."""
-
-
 WRITES = {
     "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
     "room.spz": ("convert", "room.ply", "room.spz"),
@@ -142,34 +133,6 @@ WRITES = {
     "first.png": ("render", "room.ply", "-o", "first.png", "--width", "16", "--height", "12"),
 }
 """Commands by a file that they write."""
-
-
-@pytest.fixture()
-def start(tmp_path):
-    """A function that starts a script in a process group of its own and waits until ``count`` trainings run."""
-    started: list[subprocess.Popen[str]] = []
-
-    def run(script: str, count: int) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-c", HEEDED + script, str(tmp_path)],
-            start_new_session=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        deadline = time.monotonic() + 120
-        while len(list(tmp_path.glob("*.pid"))) < count:
-            assert process.poll() is None, process.communicate()[1]
-            assert time.monotonic() < deadline, "nothing started"
-            time.sleep(0.05)
-        return process
-
-    yield run
-    for process in started:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 @pytest.mark.parametrize("name", WRITES)

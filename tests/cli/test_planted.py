@@ -105,6 +105,5 @@ def test_each_place_that_starts_processes_is_known():
     assert found == {
         "cli/demo.py",  # the programs of nerfstudio, beside this Python
         "system/memory.py",  # Python itself, with the same path
-        "system/programs.py",  # a program in an isolated Python
         "system/workers.py",  # Python itself, without the current folder on its path
     }

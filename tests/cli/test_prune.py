@@ -109,7 +109,8 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
     ],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
-    assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "not_there.ply", *options)
+    (tmp_path / "damaged.ply").touch()
+    assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "damaged.ply", *options)
 
 
 @pytest.mark.parametrize("named", ["folder", "config", "ckpt", "ckpt seen from its folder"])
@@ -181,6 +182,16 @@ def test_poses_of_a_file_are_looked_from(posed, tmp_path, capsys):
     views = read_views(poses)
     assert same(read_ply(tmp_path / "small.ply"), ps.prune(read_ply(room), "20%", "lightgaussian", views=views))
     assert same(read_ply(tmp_path / "small.ply"), ps.prune(room, "20%", "lightgaussian", views=poses))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
+def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(posed, tmp_path, capsys, suffix):
+    room, poses = posed
+    run("prune", room, "--keep", "2MB", "--poses", poses, "-o", tmp_path / f"small{suffix}")
+    said = capsys.readouterr().out
+    assert "nothing is merged, all 300 Gaussians fit as they are" in said
+    assert ("no difference from the dense scene" in said) == (suffix == ".ply")
+    assert (" dB PSNR against the dense scene" in said) == (suffix != ".ply")
 
 
 def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):

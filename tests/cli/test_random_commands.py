@@ -120,7 +120,9 @@ def command_lines(draw: st.DrawFn) -> list[str]:
     scenes = st.sampled_from([*contents(), *SPECIALS])
     parameters = inspect.signature(_command(command)).parameters.values()
     for parameter in draw(st.lists(st.sampled_from([*parameters, None]), max_size=4, unique=True)):
-        if parameter is not None and not ("Positional" in parameter.annotation or parameter.annotation == "Scene"):
+        if parameter is not None and not (
+            "Positional" in parameter.annotation or parameter.annotation.startswith("options.Scene")
+        ):
             name = "json" if parameter.name == "json_output" else parameter.name.replace("_", "-")
             words += [f"--{name}", *draw(values(parameter.name, parameter.annotation))]
         elif parameter is None:
@@ -136,15 +138,15 @@ def command_lines(draw: st.DrawFn) -> list[str]:
 
 def values(name: str, kind: str) -> st.SearchStrategy[list[str]]:
     """What follows an option, by its name and the annotation of its parameter."""
-    if kind in ("bool", "Json"):
+    if kind in ("bool", "options.Json", "options.Force", "options.Verbose"):
         return st.just([])
     known = re.findall(r"'([^']+)'", kind)
     words = st.sampled_from(known if known and "Literal" in kind else VALUES)
     if name in ("output", "picture", "html", "plot", "views") and "int" not in kind:
         words = st.sampled_from(OUTPUTS)
-    elif "Path" in kind or name in ("poses", "path"):
+    elif "Path" in kind or name in ("poses", "path", "data"):
         words = st.sampled_from([*OTHERS, *contents()])
-    elif kind.startswith(("int", "float", "tuple[int", "tuple[float")):
+    elif kind.startswith(("int", "float", "tuple[int", "tuple[float")) or name in ("jobs", "threads"):
         words = st.sampled_from(NUMBERS)
     return st.one_of(words, words, words, st.sampled_from(VALUES)).map(lambda word: [word])
 

@@ -24,9 +24,10 @@ program()
 
 
 @pytest.mark.parametrize("name", ["pointsplat_ns.cli", "inspect", "logging", "tyro", "pointsplat_ns.cli.info", "torch"])
-def test_ctrl_c_while_the_program_is_imported_is_one_word(name):
+def test_ctrl_c_while_the_program_is_imported_is_one_word(name, tmp_path):
+    (tmp_path / "room.ply").touch()
     words = INTERRUPTED.replace("sys.argv[1]:", f"{name!r}:").replace("sys.argv[1]]", f"{name!r}]")
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
@@ -35,6 +36,22 @@ def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     by_python = {"__future__", "importlib", "importlib._bootstrap", "importlib._bootstrap_external", "warnings"}
     assert {*done.stdout.split()} - by_python == {"pointsplat_ns", "pointsplat_ns.start"}
+
+
+def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path):
+    alone = [*(f"{name} a.ply" for name in ("prune", "compact", "lod", "tradeoff")), "convert a.ply b.spz"]
+    alone += ["export a.ply -o b.ply"]
+    both = ["info a.ply b.ply", "render a.ply b.ply", "view a.ply b.ply"]
+    script = (
+        "import sys\nclass NoTorch:\n    def find_spec(self, name, *_): assert name != 'torch'\n"
+        "sys.meta_path.insert(0, NoTorch())\nfrom pointsplat_ns.cli import main\n"
+        f"for words in {[*alone, *both]}:\n    try: main(words.split())\n    except SystemExit: pass"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    expected = "; expected a scene: a file of any format, a checkpoint, or a run (its folder or config.yml)"
+    said = [f"error: a.ply: no such file{expected}"] * len(alone)
+    assert done.stderr.splitlines() == said + [f"error: a.ply, b.ply: no such files{expected}"] * len(both)
+    assert (done.returncode, done.stdout, [*tmp_path.iterdir()]) == (0, "", [])
 
 
 @pytest.mark.parametrize("gigabytes", [0.5, 1.5, 2.5])

@@ -7,9 +7,8 @@ import pytest
 
 from making import cloud
 from pointsplat_ns.compression.budget_search import (
-    BUDGETS,
+    SLOPE,
     FileLimit,
-    SearchSettings,
     few_psnr,
     find_count,
     largest_within,
@@ -63,20 +62,18 @@ def test_the_count_meets_the_target_and_its_tried_neighbour_does_not(name, share
     assert meets(tried[found.count])
     missed = [count for count, value in tried.items() if not meets(value)]
     low, high = (max(missed, default=0), found.count) if at_least else (found.count, min(missed, default=MOST + 1))
-    assert high <= max(low, 1) * SearchSettings().precision or high - low == 1
+    assert high <= max(low, 1) * 1.05 or high - low == 1
     assert len(tried) <= 16
 
 
 def test_a_count_near_enough_to_the_target_ends_the_search():
-    near = SearchSettings(tolerance=0.1)
-    found, tried = searched(MEASURES["straight over the logarithm"], 28.0, True, slope=6.0, settings=near)
+    found, tried = searched(MEASURES["straight over the logarithm"], 28.0, True, slope=6.0, tolerance=0.1)
     assert 28.0 <= tried[found.count] <= 28.1 and len(tried) <= 3
 
 
 def test_tries_are_limited_once_one_meets_the_target():
-    limited = SearchSettings(tries=2)
-    assert len(searched(MEASURES["bent"], 20.0, True, settings=limited)[1]) == 2
-    found, tried = searched(MEASURES["bent"], 39.9, True, first=10, settings=limited)
+    assert len(searched(MEASURES["bent"], 20.0, True, tries=2)[1]) == 2
+    found, tried = searched(MEASURES["bent"], 39.9, True, first=10, tries=2)
     assert found.count is not None and len(tried) > 2
 
 
@@ -101,11 +98,11 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_b
     assert found.psnr == reference.psnr(found.scene)[0] >= wanted and found.worst <= found.psnr + 1e-9
     count = len(found.scene)
     below = [k for k in calls if k < count]
-    assert found.psnr <= wanted + BUDGETS.psnr.tolerance or count <= max(
-        max(below) * BUDGETS.psnr.precision, max(below) + 1
-    )
+    assert found.psnr <= wanted + 0.1 or count <= max(max(below) * 1.05, max(below) + 1)
     assert all(found.tried[k] < wanted for k in below)
-    assert len(calls) == len(set(calls)) <= 8 and all(0 <= share <= 1 for share in shares)
+    assert len(calls) == len(set(calls)) <= 8
+    steps = [after - before for before, after in zip([0.0, *shares], shares, strict=False)]
+    assert 0 < min(steps) and max(steps) <= 0.25 / len(ball_views) + 0.02 and shares[-1] < 1, "the bar never jumps"
 
 
 def test_a_psnr_that_any_scene_reaches_keeps_one_gaussian(hollow_ball, ball_views):
@@ -196,9 +193,9 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
 @pytest.mark.parametrize("kept", [1e-9, 0.1, 0.5, 0.9, 1 - 1e-9])
 def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
     """If the error of merging is A (kept^-p - 1), rounding goes by A kept^-p."""
-    power = 10 ** (-BUDGETS.slope * math.log(kept) / 10)
+    power = 10 ** (-SLOPE * math.log(kept) / 10)
     merged = 40 - 10 * math.log10(power - 1)
-    assert few_psnr(merged, kept) == pytest.approx(40 + BUDGETS.slope * math.log(kept), abs=1e-5)
+    assert few_psnr(merged, kept) == pytest.approx(40 + SLOPE * math.log(kept), abs=1e-5)
     assert few_psnr(merged, kept) < merged or kept < 1e-3
 
 

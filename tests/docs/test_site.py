@@ -98,7 +98,7 @@ TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "dropped 1 of 4": (odd, "convert room.ply other.ply"),
     "not a Splatfacto run": (room, "convert room.ply other.ply --original-frame"),
     "keep is 'half'": (room, "prune room.ply --keep half"),
-    "did you mean": (lambda: ps.save(ps.example_room(), "room.ply"), "prune room.ply --keep 10"),
+    "did you mean": (lambda: ps.save(ps.example_room(), "room.ply", overwrite=True), "prune room.ply --keep 10"),
     "opacity weight": (room, "prune room.ply --opacity-weight 0.5"),
     "no method": (room, "prune room.ply --by magic"),
     "refiner weights": (room, "compact room.ply --refiner nothing.safetensors"),

@@ -9,10 +9,10 @@ from pointsplat_ns.geometry.transforms import (
     quaternions_of,
     rotation_components,
     rotation_matrices,
+    unit_rows,
     zero_as_identity,
 )
-from pointsplat_ns.rasterizer import rasterization, reference
-from pointsplat_ns.rasterizer.spherical_harmonics import unit_rows
+from pointsplat_ns.rasterizer import reference
 from pointsplat_ns.refiner.normalize import canonical_quats
 
 
@@ -88,26 +88,3 @@ def test_short_quaternions_have_no_gradient_and_others_that_of_float64():
     for case, grad in grads.items():
         # 1e-36 has components to 1e-9; the rest is float32's rounding.
         assert torch.allclose(grad, first, rtol=1e-4, atol=1e-5), case
-
-
-def test_other_quaternions_stay_as_they_are_to_the_bit():
-    quats = random_quats()
-    quats[3, 1:] = 0.0
-    assert torch.equal(zero_as_identity(quats), quats)
-
-
-def test_the_rasterizer_draws_short_quaternions_in_float32_as_in_float64():
-    quats = random_quats(6, torch.float32) * torch.tensor([0.0, 1e-40, 5e-39, 1e-36, 1e-20, 1.0])[:, None]
-    means = torch.stack([torch.linspace(-1, 1, 6), torch.zeros(6), torch.full((6,), 3.0)], dim=1)
-    stds, K = torch.tensor([0.2, 0.05, 0.02]).expand(6, 3), torch.tensor([[40.0, 0, 24], [0, 40, 12], [0, 0, 1]])
-    images, grads = [], []
-    for dtype in (torch.float32, torch.float64):
-        leaf = quats.to(dtype, copy=True).requires_grad_()
-        values = [value.to(dtype) for value in (stds, torch.full((6,), 0.8), torch.eye(6)[:, :3], torch.eye(4)[None])]
-        images.append(rasterization(means.to(dtype), leaf, *values, K.to(dtype)[None], 48, 24)[0])
-        (images[-1] * torch.linspace(0, 1, 48, dtype=dtype)[:, None]).sum().backward()
-        grads.append(leaf.grad.double() * quats.double().norm(dim=1, keepdim=True))
-    # as float32 rasterization is tested elsewhere
-    torch.testing.assert_close(images[0].double(), images[1], rtol=0, atol=1e-5)
-    assert not grads[0][:3].any() and not grads[1][:3].any()
-    torch.testing.assert_close(*grads, rtol=1e-3, atol=1e-4)

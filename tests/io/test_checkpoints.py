@@ -6,8 +6,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import normal_scene, same_bits
-from pointsplat_ns.io.scene import kind_of
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import kind_of, source_file
 
 GOOD = normal_scene(4, 1)
 

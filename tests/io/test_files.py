@@ -1,5 +1,6 @@
 """Files: found, opened and replaced."""
 
+import csv
 import hashlib
 import os
 import shutil
@@ -11,11 +12,11 @@ import pytest
 import pointsplat_ns as ps
 from making import cloud, normal_scene
 from pointsplat_ns.errors import SceneError
+from pointsplat_ns.folders import convert_folder
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import never_replaced, replacing
-from pointsplat_ns.io.scene import save
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.files import never_replaced, replacing, write_csv
+from pointsplat_ns.io.scene import save, source_file
 
 
 def write(path: Path, text: str = "new") -> None:
@@ -89,6 +90,24 @@ def test_a_file_that_is_not_to_be_replaced_may_be_again_afterwards(tmp_path):
     with replacing(path) as part:
         part.write_text("newer")
     assert path.read_text() == "newer"
+
+
+@pytest.mark.parametrize("name", ["a.ply", "meta.json"])
+def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
+    path = tmp_path / name
+    ps.save(cloud(3), path)
+    with pytest.raises(SceneError, match="exists already; name another file, or replace it with overwrite=True"):
+        ps.save(cloud(4), path)
+    assert len(ps.load(path)) == 3
+    ps.save(cloud(4), path, overwrite=True)
+    assert len(ps.load(path)) == 4
+
+
+def test_a_file_that_appears_while_a_scene_is_written_stays(tmp_path):
+    path = tmp_path / "a.spz"
+    with pytest.raises(SceneError, match="appeared meanwhile"):
+        ps.save(cloud(4), path, progress=lambda *told: path.write_bytes(b"of others"))
+    assert path.read_bytes() == b"of others"
 
 
 def test_of_a_file_it_is_the_hash_of_its_bytes(tmp_path):
@@ -171,3 +190,30 @@ def test_a_run_is_named_by_its_experiment_wherever_the_search_begins(make_run, t
     assert [scene.name for scene in find_scenes(tmp_path)] == ["outputs/kitchen"]
     for folder in (run.parent, run.parents[1]):
         assert [scene.name for scene in find_scenes(folder)] == ["kitchen"]
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "\N{FULLWIDTH EQUALS SIGN}1"])
+def test_a_text_that_is_a_formula_gets_an_apostrophe(text, tmp_path):
+    write_csv([{"name": text, "loss": -1.5, "note": "a=b", "none": None}], tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as stream:
+        assert [*csv.DictReader(stream)] == [{"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}]
+
+
+def test_the_table_of_a_folder_holds_no_formula_of_a_file_name(tmp_path):
+    name = '=HYPERLINK("http:evil.example")'
+    ps.save(normal_scene(4), tmp_path / "in" / f"{name}.ply")
+    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
+    assert result.name == name
+    with (tmp_path / "out" / "scenes.csv").open(newline="") as stream:
+        assert [row["name"] for row in csv.DictReader(stream)] == [f"'{name}"]
+
+
+def test_links_among_the_tables_of_a_folder_are_not_written_through(tmp_path):
+    ps.save(normal_scene(4), tmp_path / "in" / "a.ply")
+    (tmp_path / "diary.txt").write_text("precious")
+    (tmp_path / "out").mkdir()
+    for name in ("scenes.csv", "a.ply.json"):
+        (tmp_path / "out" / name).symlink_to(tmp_path / "diary.txt")
+    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
+    assert result.status == "done" and (tmp_path / "diary.txt").read_text() == "precious"
+    assert not any(path.is_symlink() for path in (tmp_path / "out").iterdir())

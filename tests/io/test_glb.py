@@ -50,6 +50,14 @@ def test_holds_the_numbers_as_the_extension_names_them(tmp_path):
     assert torch.allclose(back.opacities, scene.opacities, rtol=1e-3, atol=1e-4)  # float32 opacities near 1
 
 
+def packed(content, binary):
+    """The bytes of a ``.glb``."""
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
 def glb_of(arrays, about=None, nodes=({"mesh": 0},), **changes):
     """The bytes of a ``.glb`` of one primitive: name of attribute to (array, normalized)."""
     accessors, views, binary = [], [], b""
@@ -78,10 +86,7 @@ def glb_of(arrays, about=None, nodes=({"mesh": 0},), **changes):
         "buffers": [{"byteLength": len(binary)}],
         **changes,
     }
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return packed(content, binary)
 
 
 def small_integers():
@@ -101,8 +106,7 @@ def with_nodes(path, nodes, copies=1, **changes):
     size = struct.unpack_from("<I", data, 12)[0]
     content = json.loads(data[20 : 20 + size]) | {"nodes": nodes, **changes}
     content["meshes"] *= copies
-    text = json.dumps(content).encode()
-    path.write_bytes(data[:12] + struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :])
+    path.write_bytes(packed(content, data[28 + size :]))
     return path
 
 
@@ -195,11 +199,7 @@ def spz_glb(data, extensions, copies=1, at=12):
         "bufferViews": [{"buffer": 0, "byteLength": at}, {"buffer": 0, "byteOffset": at, "byteLength": len(data)}],
         "buffers": [{"byteLength": at + len(data)}],
     }
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    binary = bytes(at) + data
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return packed(content, bytes(at) + data)
 
 
 INNER = [f"KHR_gaussian_splatting_compression_spz{end}" for end in ("", "_2")]

@@ -33,9 +33,9 @@ def levels(scene, out):
     write_levels(out / "lod", [(scene, parents)] * 2, {}, [{}, {}], force=True)
 
 WRITERS = {
-    "ply": lambda scene, out: ps.save(scene, out / "a.ply"),
-    "spz": lambda scene, out: ps.save(scene, out / "a.spz"),
-    "sog": lambda scene, out: ps.save(scene, out / "meta.json"),
+    "ply": lambda scene, out: ps.save(scene, out / "a.ply", overwrite=True),
+    "spz": lambda scene, out: ps.save(scene, out / "a.spz", overwrite=True),
+    "sog": lambda scene, out: ps.save(scene, out / "meta.json", overwrite=True),
     "json": lambda scene, out: write_json([len(scene)] * 300, out / "a.json"),
     "levels": levels,
 }

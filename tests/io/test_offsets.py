@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
@@ -18,34 +19,15 @@ from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.offsets import offset_for
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.io.ply_writing import header_bytes, row_table
 
 UTM = (451_234.6, 5_412_345.7, 312.4)
 
 
-def with_doubles(scene, path, origin=UTM, order="little", ascii_text=False):
+def with_doubles(scene, path, origin=UTM, order="<", text=False, comments=()):
     """Write a PLY whose x, y and z are doubles about an origin, and return them, float64."""
-    rows = row_table(scene)
-    names = [line.split()[-1] for line in ply_lines(scene) if line.startswith("property")]
     means = scene.means.double().numpy() + np.array(origin)
-    end = "<" if order == "little" else ">"
-    table = np.empty(len(scene), [(name, end + ("f8" if name in ("x", "y", "z") else "f4")) for name in names])
-    for column, name in enumerate(names):
-        table[name] = means[:, "xyz".index(name)] if name in ("x", "y", "z") else rows[:, column]
-    form = "ascii" if ascii_text else f"binary_{order}_endian"
-    head = ["ply", f"format {form} 1.0", f"element vertex {len(scene)}"]
-    head += [f"property {'double' if name in ('x', 'y', 'z') else 'float'} {name}" for name in names]
-    data = "\n".join([*head, "end_header", ""]).encode()
-    if ascii_text:
-        data += "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
-    else:
-        data += table.tobytes()
-    path.write_bytes(data)
+    write_columns(path, columns_of(scene) | dict(zip("xyz", means.T, strict=True)), text, order, comments)
     return means
-
-
-def ply_lines(scene):
-    return header_bytes(len(scene), scene.sh_degree).decode().splitlines()
 
 
 def absolute(scene):
@@ -53,17 +35,21 @@ def absolute(scene):
     return scene.means.double().numpy() + np.array(scene.offset or (0, 0, 0))
 
 
-@pytest.mark.parametrize("form", ["little", "big", "ascii"])
-def test_doubles_keep_their_digits_beside_an_offset(tmp_path, caplog, form):
+@pytest.mark.parametrize(("order", "text"), [("<", False), (">", False), ("<", True)])
+def test_doubles_keep_their_digits_beside_an_offset(tmp_path, caplog, order, text):
     scene = cloud(300)
-    order = "big" if form == "big" else "little"
-    means = with_doubles(scene, tmp_path / "a.ply", order=order, ascii_text=form == "ascii")
+    means = with_doubles(scene, tmp_path / "a.ply", order=order, text=text)
     with caplog.at_level(logging.INFO):
         back = ps.load(tmp_path / "a.ply")
     assert np.abs(absolute(back) - means).max() < 1e-6  # half a unit in float32
     assert all(abs(a - b) < 2 for a, b in zip(back.offset, UTM, strict=True))
     assert caplog.text.count("positions are doubles; their offset") == 1
     assert torch.equal(back.features_dc, scene.features_dc)
+
+
+def test_an_offset_in_a_comment_adds_to_that_of_doubles(tmp_path):
+    means = with_doubles(cloud(300), tmp_path / "a.ply", comments=["Offset: 100 20 3"])
+    assert np.abs(absolute(ps.load(tmp_path / "a.ply")) - means - (100, 20, 3)).max() < 1e-6
 
 
 def test_doubles_near_the_origin_get_no_offset(tmp_path):
@@ -143,7 +129,7 @@ def test_float32_that_has_lost_its_digits_is_warned_of(tmp_path, caplog):
     ps.load(tmp_path / "a.ply")
     assert "positions have lost their digits" in caplog.text
     caplog.clear()
-    ps.save(scene.replace(means=scene.means + 100), tmp_path / "a.ply")
+    ps.save(scene.replace(means=scene.means + 100), tmp_path / "a.ply", overwrite=True)
     ps.load(tmp_path / "a.ply")
     assert not caplog.records
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import normal_scene, same_bits
@@ -12,33 +13,6 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_dialects import fuse_filter
-from pointsplat_ns.io.ply_writing import row_table
-
-
-def names_of(degree):
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
-    return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-
-
-def write(path, columns, text=False, comment=""):
-    """A PLY of columns: name to an array (N,) of the type that is written."""
-    kinds = {"float32": "float", "uint8": "uchar", "uint16": "ushort", "float64": "double"}
-    rows = np.rec.fromarrays([*columns.values()], names=[*columns])
-    head = [
-        "ply",
-        f"format {'ascii' if text else 'binary_little_endian'} 1.0",
-        *([f"comment {comment}"] * bool(comment)),
-    ]
-    head += [f"element vertex {len(rows)}"]
-    head += [f"property {kinds[array.dtype.name]} {name}" for name, array in columns.items()]
-    body = "".join(" ".join(map(repr, row.tolist())) + "\n" for row in rows).encode() if text else rows.tobytes()
-    path.write_bytes("\n".join([*head, "end_header", ""]).encode() + body)
-    return path
-
-
-def columns_of(scene):
-    return dict(zip(names_of(scene.sh_degree), row_table(scene).T, strict=True))
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -48,7 +22,7 @@ def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefi
     plain = {"x", "y", "z", "nx", "ny", "nz"}
     columns = {name if name in plain else prefix + name: array for name, array in columns_of(scene).items()}
     colors = {name: np.arange(6, dtype=np.uint8) for name in ("red", "green", "blue")}
-    path = write(tmp_path / "a.ply", {**columns, **colors, "scalar_Original_cloud_index": columns["x"]}, text)
+    path = write_columns(tmp_path / "a.ply", {**columns, **colors, "scalar_Original_cloud_index": columns["x"]}, text)
     assert same_bits(ps.load(path), scene)
     assert "not read: the vertex properties red, green, blue, scalar_Original_cloud_index" in caplog.text
     assert [found.path for found in find_scenes(tmp_path)] == [path]
@@ -57,7 +31,7 @@ def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefi
 def test_a_name_that_is_there_with_and_without_a_prefix_is_read_without(tmp_path):
     scene = normal_scene(4, 0)
     columns = {"scalar_opacity": np.zeros(4, np.float32), **columns_of(scene), "scal_rot_0": np.zeros(4, np.float32)}
-    assert same_bits(ps.load(write(tmp_path / "a.ply", columns)), scene)
+    assert same_bits(ps.load(write_columns(tmp_path / "a.ply", columns)), scene)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
@@ -69,7 +43,7 @@ def test_colours_as_red_green_and_blue_are_read(tmp_path, kind, text):
     shares = np.linspace(0, 1, 15).reshape(5, 3)
     colors = dict(zip(("red", "green", "blue"), (shares * top).astype(kind).T, strict=True))
     columns = {name: array for name, array in columns_of(scene).items() if not name.startswith("f_dc")}
-    path = write(tmp_path / "a.ply", {**columns, **colors}, text, "Vertical Axis: z")
+    path = write_columns(tmp_path / "a.ply", {**columns, **colors}, text, comments=["Vertical Axis: z"])
     found = ps.load(path)
     stored = np.stack([*colors.values()], axis=1).astype(np.float64) / top
     assert np.allclose(0.5 + SH_C0 * found.features_dc.double().numpy(), stored, rtol=0, atol=1e-6)
@@ -79,7 +53,7 @@ def test_colours_as_red_green_and_blue_are_read(tmp_path, kind, text):
 def test_colours_as_floats_beyond_1_are_said(tmp_path, caplog):
     columns = {name: array for name, array in columns_of(normal_scene(3, 0)).items() if not name.startswith("f_dc")}
     colors = {name: np.array([0, 128, 255], np.float32) for name in ("red", "green", "blue")}
-    ps.load(write(tmp_path / "a.ply", {**columns, **colors}))
+    ps.load(write_columns(tmp_path / "a.ply", {**columns, **colors}))
     assert "'red', 'green' and 'blue' are float32 up to 255, read as shares of 1" in caplog.text
 
 
@@ -87,14 +61,14 @@ def test_points_with_colours_are_no_gaussians(tmp_path):
     columns = {name: np.zeros(3, np.float32) for name in "xyz"}
     columns |= {name: np.zeros(3, np.uint8) for name in ("red", "green", "blue")}
     with pytest.raises(ps.SceneError, match="lacks the vertex property 'opacity'"):
-        ps.load(write(tmp_path / "a.ply", columns))
+        ps.load(write_columns(tmp_path / "a.ply", columns))
 
 
 def test_the_3d_filter_of_mip_splatting_is_fused_as_its_exporter_does(tmp_path, caplog):
     """Against the exporter's own formulas, in float64: sizes sqrt(s^2 + f^2), opacities times sqrt(det / det)."""
     scene = normal_scene(50, 1)
     sizes = np.abs(np.random.default_rng(3).normal(size=50)).astype(np.float32)
-    path = write(tmp_path / "a.ply", {**columns_of(scene), "filter_3D": sizes})
+    path = write_columns(tmp_path / "a.ply", {**columns_of(scene), "filter_3D": sizes})
     found = ps.load(path)
     square = np.exp(scene.scales.double().numpy()) ** 2
     after = square + sizes[:, None].astype(np.float64) ** 2
@@ -146,6 +120,6 @@ def test_a_3d_filter_on_values_that_are_no_numbers_gives_none():
 def test_a_3d_filter_of_2d_gaussians_leaves_them_flat(tmp_path):
     scene = normal_scene(4, 0)
     columns = {name: array for name, array in columns_of(scene).items() if name != "scale_2"}
-    found = ps.load(write(tmp_path / "a.ply", {**columns, "filter_3D": np.full(4, 0.5, np.float32)}))
+    found = ps.load(write_columns(tmp_path / "a.ply", {**columns, "filter_3D": np.full(4, 0.5, np.float32)}))
     assert bool((found.scales[:, 2] == -87).all()) and bool((found.opacities > -20).all())
     assert bool((found.scales[:, :2] > scene.scales[:, :2]).all())

@@ -16,8 +16,7 @@ from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.formats import format_like
 from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.io.scene import kind_of
-from pointsplat_ns.io.source import source_file
+from pointsplat_ns.io.scene import kind_of, source_file
 
 SCENE = cloud(64, 3, 1)
 

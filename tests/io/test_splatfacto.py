@@ -75,7 +75,7 @@ try:
     print("loads at once")
 except Exception as error:
     print("refused", "multiarray.scalar" in str(error))
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
 count = len(torch.serialization.get_safe_globals())
 allow_splatfacto_checkpoints()
 once = torch.serialization.get_safe_globals()

@@ -6,7 +6,6 @@ import os
 import re
 import socket
 import urllib.error
-from dataclasses import replace
 from io import BytesIO
 
 import cachetools
@@ -122,13 +121,6 @@ def test_the_gradient_is_finite_where_every_feature_is_zero(alex_file):
     assert value.isfinite() and pred.grad.isfinite().all()
 
 
-def test_other_types_are_compared_in_float32(alex):
-    a, b = pair(40, 44)
-    for dtype in (torch.float64, torch.float16):
-        pred, target = a.to(dtype), b.to(dtype)
-        assert torch.equal(alex(pred, target), alex(pred.float(), target.float()).to(dtype))
-
-
 @pytest.mark.parametrize("net", NETS)
 def test_the_smallest_image_works_and_smaller_ones_are_refused(net, tmp_path):
     torch.save(random_backbone(net), tmp_path / "b.pth")
@@ -150,9 +142,12 @@ def clock(monkeypatch):
     return now
 
 
-def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, clock, monkeypatch):
+def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, clock, monkeypatch, nowhere):
     lpips = ReportedLpips("alex")
-    assert lpips(*pair(40, 40)) is None and "alex backbone cannot be downloaded" in lpips.reason
+    for seconds, asked in ((0, 1), (599, 1), (601, 2)):  # a download that failed is tried again after ten minutes
+        clock[0] = seconds
+        assert lpips(*pair(40, 40)) is None and "alex backbone cannot be downloaded" in lpips.reason
+        assert len(nowhere) == asked
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(alex_file))
     lpips = ReportedLpips("alex")
     assert torch.equal(lpips(*pair(40, 40)), alex(*pair(40, 40))) and lpips.reason is None
@@ -180,7 +175,11 @@ def test_weights_are_found_by_the_variable_or_in_the_hub_cache(
         monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / named))
     first = "network.net.slice1.0.weight"
     assert torch.equal(load_lpips("alex").state_dict()[first], alex.state_dict()[first]) and not nowhere
-    wrong = "any.pth: not the weights of LPIPS's vgg backbone; .*has shape" if named == "any.pth" else "cannot be downl"
+    wrong = (
+        "any.pth: not the weights of LPIPS's vgg backbone; expected 'features.0.weight'"
+        if named == "any.pth"
+        else "cannot be downl"
+    )
     with pytest.raises(LpipsUnavailable, match=wrong):
         load_lpips("vgg")
 
@@ -232,7 +231,7 @@ def test_a_download_is_kept_only_with_all_digits_of_its_sha_256(alex_file, tmp_p
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
     for digest in (right[:-1] + "0123456789abcdef"[int(right[-1], 16) ^ 1], right):
         monkeypatch.setattr(torch.hub, "urlopen", lambda *args, **kwargs: Answer(data))
-        monkeypatch.setitem(lpips._BACKBONES, "alex", replace(lpips._BACKBONES["alex"], digest=digest))
+        monkeypatch.setitem(lpips._BACKBONES, "alex", lpips._BACKBONES["alex"]._replace(digest=digest))
         if digest == right:
             load_lpips("alex")
         else:
@@ -253,8 +252,8 @@ def test_the_digests_are_those_that_the_names_of_the_files_begin():
         (b"PK garbage", "truncated or not a state dict"),
         (b"", "truncated or not a state dict"),
         ([torch.zeros(1)], "holds a list; expected a state dict"),
-        ({"net.0.weight": torch.zeros(1)}, r"lacks 'features.0.weight' \(found net.0.weight\)"),
-        ({"features.0.weight": torch.zeros(64, 3, 3, 3)}, r"has shape \(64, 3, 3, 3\), expected \(64, 3, 11, 11\)"),
+        ({"net.0.weight": torch.zeros(1)}, r"expected 'features.0.weight' of .*; found \['net.0.weight'\]"),
+        ({"features.0.weight": torch.zeros(64, 3, 3, 3)}, r"of shape \(64, 3, 11, 11\); found \(64, 3, 3, 3\)"),
     ],
 )
 def test_files_that_are_no_backbone_are_said(tmp_path, content, message):

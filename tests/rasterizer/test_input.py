@@ -1,16 +1,12 @@
 """What is given to the rasterizer."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 
-import pointsplat_ns as ps
-from making import camera_askew, cloud, splats_in_view
+from making import camera_askew, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.drawing import Drawing
-from pointsplat_ns.rasterizer.tiles import Region
 
 F64 = torch.float64
 
@@ -114,26 +110,3 @@ def test_colours_up_to_the_largest_number_have_finite_gradients(value, sh_degree
     assert image.isfinite().all() and (value > 1e31) == (meta["skipped"] > 0)
     for grad in torch.autograd.grad(image.sum(), leaves):
         assert grad.isfinite().all()
-
-
-@pytest.fixture(scope="module")
-def scene() -> ps.Gaussians:
-    return cloud(400)
-
-
-@pytest.fixture(scope="module", params=["classic", "antialiased"])
-def view(request, scene) -> ps.View:
-    """Neither side is a multiple of a tile's."""
-    sampled = ps.sample_views(scene, 1, 75, 53)[0]
-    return dataclasses.replace(sampled, background=torch.tensor([0.2, 0.4, 0.9]), rasterize_mode=request.param)
-
-
-@pytest.mark.parametrize("high", [1, 3, 7])
-def test_bands_are_the_rows_of_the_render(scene, view, high):
-    drawing = Drawing(scene, view)
-    bands = [
-        drawing.draw(Region(top, min(top + high, drawing.rows), 0, drawing.columns))
-        for top in range(0, drawing.rows, high)
-    ]
-    # The blocks of tiles differ, and with them the order of sums in float32.
-    torch.testing.assert_close(torch.cat(bands), ps.render(scene, view), rtol=0, atol=1e-5)

@@ -9,12 +9,12 @@ import torch
 from making import assert_same_on_any_threads, normal_scene
 from pointsplat_ns.rasterizer import pictures, pixels_of, rasterization, render
 from pointsplat_ns.rasterizer import scene as drawing
+from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.views import View
 
 WIDTH, HEIGHT = 67, 43
 
-missing = pictures.KERNELS.why_missing
-needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
 def scene_of(degree=3, count=3000):

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from making import camera_askew, splats_in_view
-from pointsplat_ns.rasterizer.colors import sh_to_color
 from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 
 F64 = torch.float64
 

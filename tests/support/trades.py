@@ -4,8 +4,8 @@ import math
 from bisect import bisect_left
 from dataclasses import dataclass, field
 
-from pointsplat_ns.tradeoff.points import ImageMetrics, Point
-from pointsplat_ns.tradeoff.settings import DENSE, Setting
+from pointsplat_ns.pruning import ply_bytes
+from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting
 
 
 def point(
@@ -22,7 +22,7 @@ def point(
         gaussians=setting.count,
         sh_degree=setting.sh_degree,
         repair=setting.repair,
-        bytes=setting.bytes,
+        bytes=ply_bytes(setting.count, setting.sh_degree),
         against_dense=ImageMetrics(psnr, 0.9),
         against_photos=None if photos is None else ImageMetrics(photos, 0.8, 0.2),
         frame_ms=ms,
@@ -78,5 +78,5 @@ class Trade:
                 if self.psnr(Setting(self.count, degree, repair)) >= psnr:
                     counts = range(1, self.count + 1)
                     enough = bisect_left(counts, True, key=lambda n: self.psnr(Setting(n, degree, repair)) >= psnr)  # noqa: B023
-                    sizes.append(Setting(counts[enough], degree, repair).bytes)
+                    sizes.append(ply_bytes(counts[enough], degree))
         return min(sizes)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pointsplat_ns.system import cores as cores_module
-from pointsplat_ns.system.cores import FreeCores, Group, Limit, OtherPrograms
+from pointsplat_ns.system.cores import FreeCores, Group, OtherPrograms
 from pointsplat_ns.system.threads import fixed_threads, in_threads, most_threads, suitable_threads
 from pretend_gpu import GPU
 
@@ -36,9 +36,9 @@ class Machine:
             for used, (_, others) in zip(self.in_groups or [0.0] * len(self.quotas), self.quotas, strict=True)
         ]
 
-    def limit(self) -> Limit:
+    def limit(self) -> tuple[float, float]:
         self.looks += 1
-        return Limit(self.count, self.used)
+        return self.count, self.used
 
     def groups(self, root=None) -> tuple[Group, ...]:
         return tuple(Group(quota, number) for number, (quota, _) in enumerate(self.quotas))
@@ -73,9 +73,7 @@ def used(device: torch.device | None = None) -> int:
     ("count", "others", "threads"),
     [
         (16, 0.0, 16),
-        (16, 0.4, 16),
         (16, 2.1, 14),
-        (16, 15.2, 1),
         (16, 16.0, 1),
         (2, 0.3, 2),
         (2, 2 / 3, 1),
@@ -128,7 +126,7 @@ def test_programs_on_cores_that_this_process_may_not_use_do_not_count(monkeypatc
     busy, idle = busy._replace(user=7.0, system=2.0, idle=1.0), idle._replace(idle=10.0)
     monkeypatch.setattr(psutil, "cpu_times", lambda percpu: [busy, idle, busy, idle])
     monkeypatch.setattr(cores_module, "_allowed", lambda: [1, 2, 9])  # a container may be shown fewer than it has
-    assert cores_module._machine() == Limit(2, 9.0)
+    assert cores_module._machine() == (2, 9.0)
 
 
 def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypatch):
@@ -137,15 +135,12 @@ def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypat
 
     monkeypatch.setattr(psutil, "cpu_times", refused)
     monkeypatch.setattr(cores_module, "_allowed", lambda: [0, 1, 2])
-    assert cores_module._machine() == Limit(3, 0.0)
+    assert cores_module._machine() == (3, 0.0)
 
 
 def test_time_that_a_control_group_has_used_is_read_in_seconds(tmp_path):
     assert cores_module._seconds_of(tmp_path) == 0.0
-    (tmp_path / "cpuacct.usage").write_text("2500000000\n")
-    (tmp_path / "cpu.stat").write_text("nr_periods 12\nnr_throttled 3\n")  # version 1
-    assert cores_module._seconds_of(tmp_path) == 2.5
-    (tmp_path / "cpu.stat").write_text("usage_usec 1500000\nuser_usec 1000000\n")  # version 2
+    (tmp_path / "cpu.stat").write_text("nr_periods 12\nusage_usec 1500000\nuser_usec 1000000\n")
     assert cores_module._seconds_of(tmp_path) == 1.5
 
 

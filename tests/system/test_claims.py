@@ -12,16 +12,6 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.system.claims import claim
 
 
-def test_a_lock_that_is_a_hard_link_leaves_its_file_as_it_was(tmp_path):
-    target, lock = tmp_path / "diary.txt", tmp_path / "lock"
-    target.write_text("precious")
-    target.chmod(0o600)
-    os.link(target, lock)
-    with claim(lock) as held:
-        assert held
-    assert target.read_text() == "precious" and target.stat().st_mode & 0o777 == 0o600
-
-
 @pytest.mark.parametrize("there", [True, False])
 def test_a_lock_that_is_a_link_is_refused_and_not_followed(there, tmp_path):
     target, lock = tmp_path / "diary.txt", tmp_path / "lock"

@@ -1,18 +1,15 @@
 """Python calls C++ by what the C++ file declares."""
 
 import ctypes
+import re
 import shutil
 import subprocess
 
 import pytest
 import torch
 
-from pointsplat_ns.merging import covariance, matching, pair_cost, regrouping, replacement
-from pointsplat_ns.metrics import structural_similarity
-from pointsplat_ns.rasterizer import pictures
-from pointsplat_ns.rasterizer.compiled import blending, colors, projection, tiles
 from pointsplat_ns.system.kernels import functions_of, structs_of
-from pointsplat_ns.system.native import INCLUDE
+from pointsplat_ns.system.native import INCLUDE, cpp_files
 
 SHARED = """
 struct Hidden {
@@ -42,23 +39,21 @@ void pointsplat_run(const Task* task, const int64_t* rows,
 
 }  // extern "C"
 """
-MODULES = (blending, colors, pictures, projection, tiles, structural_similarity)
-MERGING = (covariance, matching, pair_cost, regrouping, replacement)
-KERNELS = [module.KERNELS for module in MODULES + MERGING]
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
-@pytest.mark.parametrize("kernels", KERNELS, ids=lambda kernels: kernels.source.stem)
-def test_structs_are_laid_out_as_the_compiler_lays_them_out(kernels, tmp_path):
-    structs = kernels.structs
+@pytest.mark.parametrize("source", cpp_files(), ids=lambda source: source.stem)
+def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
+    text = source.read_text("utf-8")
+    included = [source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
+    structs = structs_of("".join(path.read_text("utf-8") for path in (*included, source) if path.is_file()))
     assert structs
-    lines = ["#include <cstddef>", f'#include "{kernels.source}"']
+    lines = ["#include <cstddef>", f'#include "{source}"']
     for name, struct in structs.items():
         lines.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(struct)});")
-        lines += [
-            f"static_assert(offsetof({name}, {field}) == {getattr(struct, field).offset});" for field in struct.members
-        ]
+        places = {field: getattr(struct, field).offset for field, _ in struct._fields_}
+        lines += [f"static_assert(offsetof({name}, {field}) == {place});" for field, place in places.items()]
     check = tmp_path / "check.cpp"
     check.write_text("\n".join(lines) + "\n", "utf-8")
     subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)], check=True)
@@ -69,7 +64,7 @@ def test_what_is_shared_is_declared_with_its_types():
     assert [*structs] == ["Inner", "Task"]
     assert structs["Inner"]._fields_ == [("number", ctypes.c_int32), ("values", ctypes.c_double * 6)]
     fields = [("inner", structs["Inner"]), ("a", ctypes.c_void_p), ("b", ctypes.c_void_p), ("count", ctypes.c_int64)]
-    assert structs["Task"]._fields_ == fields and structs["Task"].members["a"].dtype == torch.float32
+    assert structs["Task"]._fields_ == fields and structs["Task"].pointers["a"].dtype == torch.float32
     functions = functions_of(SHARED, structs)
     assert functions["pointsplat_size"] == (ctypes.c_int, [])
     result, (task, rows, count) = functions["pointsplat_run"]

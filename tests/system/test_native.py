@@ -30,7 +30,7 @@ def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path, monkey
 
 
 @pytest.mark.skipif(not IS_X86, reason="other processors have all that the kernels need")
-def test_a_processor_without_avx2_is_told_before_the_library_ends_the_program(monkeypatch):
+def test_a_processor_without_avx2_loads_no_library(monkeypatch):
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
     assert "no AVX2" in kernels._why_not_loaded()
 
@@ -85,7 +85,7 @@ def python(folder: Path, *words: str, **environment: str) -> subprocess.Complete
     return done
 
 
-def test_a_clone_without_kernels_draws_by_torch_and_says_once_how_to_build_them(tmp_path):
+def test_a_clone_without_kernels_draws_by_torch_and_says_how_to_build_them(tmp_path):
     """Also where the compiler fails, and one whose sources have changed since."""
     pytest.importorskip("setuptools", minversion="77")
     shutil.copytree(

@@ -1,15 +1,13 @@
-"""Progress, and programs that are called."""
+"""Progress bars, and lines in place of them."""
 
 import io
 import re
 import sys
 import time
 
-import psutil
 import pytest
 
 from pointsplat_ns.system import progress
-from pointsplat_ns.system.programs import ProgramFailed, run_measured
 from pointsplat_ns.system.progress import progress_bar, tracked
 
 
@@ -69,55 +67,3 @@ def test_the_bar_is_taken_away_when_the_work_fails(stderr):
         report("Failing", 0.5)
         raise ValueError
     assert shown.getvalue().endswith("\x1b[2K")
-
-
-PARENT, CHILD = 2**30, 200_000_000
-"""Bytes held by the process that measures, and by the one that is measured."""
-
-
-def python(code: str) -> list[str]:
-    return [sys.executable, "-I", "-S", "-c", code]
-
-
-def test_peak_memory_is_the_childs_own_and_not_its_parents():
-    held = b"x" * PARENT
-    small = run_measured(python("pass")).peak_bytes
-    large = run_measured(python(f"held = b'x' * {CHILD}")).peak_bytes
-    assert len(held) == PARENT
-    assert small < CHILD / 4  # an interpreter alone takes about 10 MB
-    assert large - small == pytest.approx(CHILD, rel=0.02)  # pages, and what the allocator adds
-
-
-def test_peak_memory_is_that_of_the_largest_process():
-    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', 'held = b\"x\" * {CHILD}'], check=True)"
-    assert run_measured(python(code)).peak_bytes > CHILD
-
-
-@pytest.mark.parametrize(
-    "command, said",
-    [
-        (python("import sys; sys.exit('no\\nsuch\\nscene')"), "ended with status 1: no such scene$"),
-        (python("import os; os.kill(os.getpid(), 9)"), "was killed by signal 9"),
-        (["/no/such/program"], "/no/such/program.*FileNotFoundError|No such file"),
-    ],
-    ids=["fails", "is killed", "is not there"],
-)
-def test_a_program_that_fails_is_an_error_with_what_it_said_in_one_line(command, said):
-    with pytest.raises(ProgramFailed, match=said):
-        run_measured(command)
-
-
-def test_a_program_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
-    started = tmp_path / "started"
-    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {WAITS!r}, {str(started)!r}])"
-    with pytest.raises(ProgramFailed, match="took more than 3 s and was ended"):
-        run_measured(python(code), timeout=3)
-    number = int(started.read_text())
-    for _ in range(100):  # until the system has taken it away
-        if not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE:
-            return
-        time.sleep(0.05)
-    pytest.fail(f"process {number} is still there")
-
-
-WAITS = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"

@@ -10,8 +10,8 @@ from making import box_room
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.measuring import Subject
-from pointsplat_ns.tradeoff.sweep import Sweep, SweepOptions
+from pointsplat_ns.tradeoff.making import Subject
+from pointsplat_ns.tradeoff.table import Sweep
 from pointsplat_ns.views import Views
 
 
@@ -31,14 +31,12 @@ def room_views(room) -> Views:
 
 @pytest.fixture()
 def new_sweep(room, room_views, plain_page, no_lpips, monkeypatch) -> Callable[..., Sweep]:
-    """A function (folder, options) that begins a sweep of the room, to a tenth unless told otherwise, whose repairs
-    take two steps."""
+    """A function (folder, options) that begins a sweep of the room, whose repairs take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
 
     def begin(folder: Path, held_out=None, sha256="sum", **options) -> Sweep:
         dense = ps.load(room)
         subject = Subject(dense, room, "room", lambda: ViewSource(dense, given=room_views), held_out)
-        options = SweepOptions(**{"keep": ("10%",), "repairs": ("none",), **options})
-        return Sweep(subject, sha256, folder, options, lambda what, share: None)
+        return Sweep(subject, sha256, folder, **{"progress": lambda what, share: None, **options})
 
     return begin

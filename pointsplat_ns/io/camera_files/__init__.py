@@ -1,24 +1,176 @@
-"""Readers of files of cameras, one module per format: poses and intrinsics that others wrote, as views.
+"""Readers of files of cameras: poses and intrinsics that others wrote, as views.
 
 Every file may come from a stranger: it is read within limits, and refused in one line.
 """
 
-from pointsplat_ns.io.camera_files.registry import (
-    CAMERA_KINDS,
-    NamedViews,
-    camera_files_near,
-    is_camera_file,
-    read_named_views,
-    read_views,
-    transforms_beside,
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.io.camera_files.cameras import (
+    CAMERA_LIMITS,
+    Camera,
+    CameraFile,
+    Motion,
+    checked_views,
+    photo_order,
+    rigid,
+)
+from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
+from pointsplat_ns.io.camera_files.json_cameras import exported_cameras, inria_cameras, nerfstudio_cameras
+from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
+from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
+from pointsplat_ns.io.runs import RUN_FILES, read_transforms
+from pointsplat_ns.views import Views
+
+CAMERA_KINDS = (
+    "cameras.json of 3DGS, transforms.json of nerfstudio, transforms_train.json of ns-export cameras, or the folder of "
+    "a COLMAP model or project"
 )
 
-__all__ = [
-    "CAMERA_KINDS",
-    "NamedViews",
-    "camera_files_near",
-    "is_camera_file",
-    "read_named_views",
-    "read_views",
-    "transforms_beside",
-]
+
+@dataclass(frozen=True, eq=False)
+class NamedViews:
+    """Views of a file of cameras, and where their photos may lie."""
+
+    views: Views
+    names: Sequence[str]
+    """Of the photo of each view, as the file has it; empty if it has none."""
+    folders: Sequence[Path]
+    """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model in the folders
+    ``images`` of the project."""
+    cameras: Sequence[Camera]
+    """As the file has them, in the order of the views."""
+    saved: Motion | None
+    """The motion of the dataset's world before the file was saved, see :class:`~cameras.CameraFile`."""
+    motion: Motion | None
+    """What moved the poses of the file into the frame of the scene; None if nothing did."""
+
+    @property
+    def in_scene_frame(self) -> bool:
+        """Whether the format of the file says that its poses are in the frame of a trained scene."""
+        return self.saved is None
+
+    def photo(self, index: int) -> Path | None:
+        """The photo of a view; None if it does not lie in one of the folders or below."""
+        relative = PurePosixPath(self.names[index] if "\0" not in self.names[index] else "")
+        if not relative.name or relative.is_absolute() or ".." in relative.parts:  # nothing outside is opened
+            return None
+        found = (folder / f"{relative}{suffix}" for folder in self.folders for suffix in ("", ".png"))
+        with suppress(OSError):
+            return next((file for file in found if file.is_file()), None)
+        return None
+
+
+def is_camera_file(path: Path | str) -> bool:
+    """Whether a path is no run and no scene, so that it can only hold cameras. The content of a file is not read."""
+    path = Path(path)
+    if path.is_dir():
+        return model_folder(path) is not None or not any(
+            (path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META)
+        )
+    return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
+
+
+def camera_files_near(scene: Path) -> list[Path]:
+    """Files of cameras and COLMAP projects where training programs leave them: beside the file of a scene, the folder
+    of a training of 3DGS above ``point_cloud/iteration_N``, and a COLMAP project that holds the file or its folder."""
+    folder = scene.absolute().parent
+    roots = [folder.parents[1]] if folder.parent.name == "point_cloud" else []
+    files = [root / "cameras.json" for root in (*roots, folder)]
+    files += [folder / name for name in ("transforms_train.json", "transforms.json")]
+    return [*filter(Path.is_file, files), *(place for place in (folder, folder.parent) if model_folder(place))]
+
+
+def transforms_beside(path: Path | str) -> Path | None:
+    """The ``dataparser_transforms.json`` in a folder, or beside a file or folder; None if there is none."""
+    path = Path(path)
+    places = (path / RUN_FILES.transforms, path.parent / RUN_FILES.transforms)
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_views(path: Path | str, transforms: Path | None = None) -> Views:
+    """Read the cameras of a file.
+
+    Lens distortion is ignored, which is logged. Cameras whose pictures have another size than most get that size: they
+    see the same field of view, by other focal lengths.
+
+    Args:
+        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, the ``transforms_train.json`` of ``ns-export
+            cameras``, or the folder of a COLMAP model or project.
+        transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of
+            ``transforms.json`` and of COLMAP into the frame of the scene. By default the one beside ``path``, if there
+            is one. Poses of the others are in the scene's frame already.
+
+    Returns:
+        C views, float64 on the CPU, over black, in the order of the names of their photos.
+
+    Raises:
+        SceneError: if there is no such file, or the transforms are not usable.
+        DataError: if the file is none of these, too large or damaged, or a camera is not usable.
+
+    Example:
+        >>> import json, tempfile, torch
+        >>> frames = [{"file_path": "a.png", "transform_matrix": torch.eye(4).tolist()}]
+        >>> content = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "transforms.json")
+        ...     _ = path.write_text(json.dumps(content))
+        ...     views = read_views(path)
+        >>> len(views), views.width, views.height
+        (1, 64, 48)
+    """
+    return read_named_views(path, transforms).views
+
+
+def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
+    """As :func:`read_views`, with where the photos may lie."""
+    path = Path(path)
+    model = model_folder(path)
+    found = _json_cameras(path) if model is None else colmap_cameras(path)
+    folders = [path.parent, path.absolute().parent.parent / "resized_images"]
+    if model is not None:
+        folders = [above / "images" for above in (model, *model.absolute().parents[:3])]
+    motion, transforms = None, transforms or transforms_beside(path)
+    if found.saved is not None and transforms is not None:
+        transform, scale = read_transforms(transforms)
+        exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
+        logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
+        motion = found.saved.undone_before(Motion(exact, scale))
+    names = [camera.name for camera in found.cameras]
+    views = checked_views(path, found.cameras, motion)
+    order = photo_order(names)
+    cameras = [found.cameras[index] for index in order]
+    return NamedViews(views, [names[index] for index in order], folders, cameras, found.saved, motion)
+
+
+def _json_cameras(path: Path) -> CameraFile:
+    """The cameras of a JSON file: a list is INRIA's or of ns-export, an object with frames nerfstudio's."""
+    if path.is_dir():
+        raise DataError(
+            f"{path}: a folder without cameras.bin or cameras.txt, there or in sparse/0; expected {CAMERA_KINDS}"
+        )
+    path = require_file(path, CAMERA_KINDS)
+    size = path.stat().st_size
+    if size > CAMERA_LIMITS.file_bytes:
+        raise DataError(
+            f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {CAMERA_LIMITS.file_bytes / 1e6:.0f} MB"
+        )
+    require_memory(path, 24 * size)  # most memory that a byte of JSON takes: empty lists are the worst
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}") from error
+    if isinstance(content, list):
+        exported = bool(content) and isinstance(content[0], dict) and "transform" in content[0]
+        return exported_cameras(content, path) if exported else inria_cameras(content, path)
+    if isinstance(content, dict) and isinstance(content.get("frames"), list):
+        return nerfstudio_cameras(content, path)
+    if isinstance(content, dict) and "camera_path" in content:
+        raise DataError(f"{path}: a camera path of nerfstudio's viewer, for `render --path`; expected {CAMERA_KINDS}")
+    raise DataError(f"{path}: JSON without a list of cameras; expected {CAMERA_KINDS}")

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits, sh_degree_of
-from pointsplat_ns.io.files import keep_usable, require_file, require_memory
+from pointsplat_ns.io.files import require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     Array,
     Blocks,
@@ -33,6 +33,7 @@ from pointsplat_ns.io.formats.coding import (
 )
 from pointsplat_ns.io.formats.holding import FLOAT, Holds, Span, within_colours
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 
 CHUNK_GAUSSIANS = 256

@@ -18,7 +18,7 @@ import torch
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.io.files import keep_usable, logger, require_file, require_memory
+from pointsplat_ns.io.files import logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     PACKED,
     Array,
@@ -37,6 +37,7 @@ from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
 from pointsplat_ns.io.formats.spz import decode_spz
 from pointsplat_ns.io.offsets import SAMPLED, offset_for
 from pointsplat_ns.io.turning import Similarity
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -50,7 +51,6 @@ _SPZ = "KHR_gaussian_splatting_compression_spz"
 """Inside :data:`_EXTENSION`, mostly with a version: ``_2``."""
 _OLD_SPZ = "KHR_spz_gaussian_splats_compression"
 """As CesiumJS drew it in 2025, in place of :data:`_EXTENSION`."""
-_MOST_PLACES = 10_000  # nodes with Gaussians
 
 
 def read_glb(path: Path | str) -> Gaussians:
@@ -76,8 +76,8 @@ def read_glb(path: Path | str) -> Gaussians:
         if not meshes:
             raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
         placed = [(meshes[index], matrix) for index, matrix in _shown(content) if index in meshes]
-        if len(placed) > _MOST_PLACES:
-            raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most {_MOST_PLACES}")
+        if len(placed) > 10_000:
+            raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most 10000")
         require_memory(path, 4 * sum(len(mesh) * (11 + 3 * (mesh.sh_degree + 1) ** 2) for mesh, _ in placed))
         offset = _offset_of(*placed[0]) if placed else None
         moved = [_moved(mesh, _translated(matrix, offset), path) for mesh, matrix in placed]

@@ -19,28 +19,11 @@ from pointsplat_ns.io.formats.rounding import weights
 from pointsplat_ns.io.offsets import offset_text
 from pointsplat_ns.system.tensors import DOUBLES
 
+_REPORTED = 0.01
+"""Share of the Gaussians that lose something, by number or by weight in pictures, above which a loss is reported."""
 
-@dataclass(frozen=True)
-class HoldingSettings:
-    """Thresholds above which a loss is reported."""
-
-    coarse: float = 0.25
-    """Median step of positions, in sizes of Gaussians. At a quarter, renders have about 42 to 52 dB."""
-    misplaced: float = 0.0025
-    """Share of Gaussians with steps of positions above their largest size. Real splats have at most 0.0004."""
-    share: float = 0.01
-    """Share of the Gaussians that lose something, by number or by weight in pictures."""
-    colour: float = 0.2
-    """Error of the colour of a Gaussian in the direction in which it is largest, where 1 is white."""
-    colour_step: float = 0.02
-    """Step of colours, where 1 is white."""
-    dark: float = -0.44
-    """Colour, of the constant SH coefficient alone, that black need not fall below."""
-    directions: int = 64
-    """Directions that a colour is seen from."""
-
-
-HOLDING = HoldingSettings()
+_DARKEST = (-0.44 - 0.5) / SH_C0
+"""Constant SH coefficient that black need not fall below."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +79,7 @@ class Holds:
 def losses(scene: Gaussians, holds: Holds) -> list[str]:
     """What a scene, float32 on the CPU, loses in a format: a clause with numbers for each attribute, none where the
     format holds it."""
-    settings, found = HOLDING, []
+    found = []
     if scene.antialiased and not holds.antialiased:
         found.append("the mark of antialiased training")
     if scene.offset is not None and not holds.offset:
@@ -109,12 +92,12 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
         steps = holds.position_steps(fitted).double()
         times = float((steps / typical_sizes(fitted)).median())
         misplaced = _share(steps > fitted.scales.double().amax(dim=1).exp(), fitted)
-        if times > settings.coarse:
+        if times > 0.25:  # at a quarter, renders have about 42 to 52 dB
             found.append(
                 f"positions are rounded to {float(steps.median()):.2g} units, {times:.2g} times the median size of a "
                 "Gaussian"
             )
-        elif misplaced > settings.misplaced:
+        elif misplaced > 0.0025:  # real splats have at most 0.0004
             found.append(f"positions of {_percent(misplaced)} of the Gaussians are rounded by more than their size")
     ordered, sizes = scene.scales.sort(dim=1).values, holds.sizes
     drawn = scene.replace(scales=scene.scales.clamp_min(sizes.low))  # as large as the smallest become
@@ -123,16 +106,16 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
     if holds.sh is None and scene.sh_degree:
         found.append(f"SH of degree {scene.sh_degree} are left out, so colours no longer change with the view")
     error = _colour_errors(scene, fitted, holds)
-    share = _share(error > settings.colour, scene)
-    if share > settings.share:
+    share = _share(error > 0.2, scene)
+    if share > _REPORTED:
         found.append(
             f"{_percent(share)} of the Gaussians have colours outside of its range, by {float(error.max()):.2g} of "
             "white at most"
         )
     if holds.colour_steps is not None:
         steps = SH_C0 * holds.colour_steps(fitted)
-        share = _share(steps > settings.colour_step, scene)
-        if share > settings.share:
+        share = _share(steps > 0.02, scene)
+        if share > _REPORTED:
             found.append(f"{_percent(share)} of the colours are rounded to {float(steps.max()):.2g} of white at most")
     return found
 
@@ -151,8 +134,8 @@ def seen_colours(dc: Tensor, rest: Tensor) -> Tensor:
 
 def _basis(count: int) -> Tensor:
     """The first ``count`` basis functions above degree 0, (count, D) float64, in directions on a spiral."""
-    number = torch.arange(HOLDING.directions, **DOUBLES)
-    z = 1 - (2 * number + 1) / HOLDING.directions
+    number = torch.arange(64, **DOUBLES)
+    z = 1 - (2 * number + 1) / 64
     angle, radius = number * math.pi * (3 - math.sqrt(5)), (1 - z.square()).sqrt()
     rows = basis_rows(torch.stack([radius * angle.cos(), radius * angle.sin(), z]), 3)
     return torch.stack(rows[1 : count + 1]) if count else torch.zeros(0, len(z), **DOUBLES)
@@ -166,11 +149,10 @@ def within_colours(scene: Gaussians, colours: Span, sh: Span) -> Gaussians:
     with the least squared error of :func:`seen_colours` is taken, for each Gaussian and channel that is out of range.
     """
     dc, rest = scene.features_dc, scene.features_rest.transpose(1, 2)  # (N, 3), (N, 3, K)
-    darkest = (HOLDING.dark - 0.5) / SH_C0
-    dark = (dc < darkest).nonzero(as_tuple=True)
+    dark = (dc < _DARKEST).nonzero(as_tuple=True)
     if len(dark[0]):
         unseen = (-0.5 - _peaks(rest[dark])) / SH_C0  # black from everywhere, if dc is lower
-        dc = dc.index_put(dark, torch.maximum(dc[dark], unseen.clamp_max(darkest)))
+        dc = dc.index_put(dark, torch.maximum(dc[dark], unseen.clamp_max(_DARKEST)))
         scene = scene.replace(features_dc=dc)
     outside = ~(colours.holds(dc) & sh.holds(rest).all(dim=2))
     if not bool(outside.any()):
@@ -190,7 +172,7 @@ def _most_alike(dc: Tensor, rest: Tensor, colours: Span, sh: Span) -> tuple[Tens
     best_dc, best_rest = dc.clamp(colours.low, colours.high), rest.clamp(sh.low, sh.high)
     largest = rest.abs().amax(dim=1) if rest.shape[1] else torch.zeros_like(dc)
     fitting = (min(-sh.low, sh.high) / largest.clamp_min(1e-30)).clamp_max(1.0)
-    peak, dark = _peaks(rest), torch.full_like(dc, (HOLDING.dark - 0.5) / SH_C0)
+    peak, dark = _peaks(rest), torch.full_like(dc, _DARKEST)
     seen = (rest @ _basis(rest.shape[1]).to(rest)).amax(dim=1)
 
     def offer(new_dc: Tensor, new_rest: Tensor) -> None:
@@ -232,7 +214,7 @@ def _colour_errors(scene: Gaussians, fitted: Gaussians, holds: Holds) -> Tensor:
 
 
 def _cut(mask: Tensor, scene: Gaussians, than: str, limit: float, drawn: str) -> list[str]:
-    if _weight(mask, scene) <= HOLDING.share:
+    if _weight(mask, scene) <= _REPORTED:
         return []
     count = _percent(float(mask.double().mean()))
     return [f"{count} of the Gaussians are {than} than {math.exp(limit):.2g} units and become {drawn}"]

@@ -16,7 +16,7 @@ import numpy as np
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, require_file, require_memory
+from pointsplat_ns.io.files import require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     Array,
     Blocks,
@@ -28,6 +28,7 @@ from pointsplat_ns.io.formats.coding import (
     scene_of,
 )
 from pointsplat_ns.io.formats.holding import Holds, Span
+from pointsplat_ns.io.usable import keep_usable
 
 _HEADER, _SECTION = 4096, 1024
 _TYPES = {"means": ("<f4", "<u2", "<u2"), "floats": ("<f4", "<f2", "<f2"), "sh": ("<f4", "<f2", "u1")}

@@ -23,7 +23,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, replacing
+from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.coding import (
     Array,
     bytes_of_logits,
@@ -41,6 +41,7 @@ from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import FLOATS
 

@@ -21,10 +21,11 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.io.files import keep_usable, read_text, replacing, require_file, require_memory, unusable_kept
+from pointsplat_ns.io.files import read_text, replacing, require_file, require_memory
 from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts
 from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.io.usable import keep_usable, unusable_kept
 from pointsplat_ns.system.progress import Progress, silent
 
 STREAM_META = "lod-meta.json"

@@ -14,7 +14,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import keep_usable, require_file, require_memory
+from pointsplat_ns.io.files import require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     bytes_of_logits,
     damage_named,
@@ -28,6 +28,7 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.io.files import keep_usable, logger, require_file
+from pointsplat_ns.io.files import logger, require_file
 from pointsplat_ns.io.formats.coding import (
     Array,
     Blocks,
@@ -38,6 +38,7 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.io.formats.spz_range import COLOUR_SCALE, MAX_FRACTION_BITS, SIZES, fitted, fraction_bits
 from pointsplat_ns.io.turning import turned
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 

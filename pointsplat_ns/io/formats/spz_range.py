@@ -25,17 +25,13 @@ COLOUR_SCALE = 0.15
 COLOURS = Span(-0.5 / COLOUR_SCALE, 0.5 / COLOUR_SCALE, 1 / (255 * COLOUR_SCALE))
 SH = Span(-1.0, 127 / 128, 1 / 128)
 
-_STEPS_A_SIZE = 8
-"""Steps of positions in the median size of a Gaussian, at least, if the range allows it."""
-_MOVED_SHARE = 0.01
-"""Gaussians that are moved nearer, at most, as a share of all, if the others then get enough steps."""
-
 
 def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
     """A scene, float32 on the CPU, in the range of SPZ, and which Gaussians were moved, in words.
 
-    If few Gaussians are so far away that positions of all others would become coarse, they move towards the median
-    position and shrink in proportion: from there they look the same. Colours are as of :func:`within_colours`.
+    If few Gaussians, at most 1 %, are so far away that positions of all others would become coarse, they move towards
+    the median position and shrink in proportion: from there they look the same. Colours are as of
+    :func:`within_colours`.
     """
     scene = within_colours(scene, COLOURS, SH)
     if not len(scene):
@@ -47,7 +43,7 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
     reach = math.ldexp(FARTHEST - 1, -bits)
     far = scene.means.abs().amax(dim=1) > reach
     count = int(far.sum())
-    if count > math.ceil(_MOVED_SHARE * len(scene)) or count == len(scene):
+    if count > math.ceil(0.01 * len(scene)) or count == len(scene):
         return scene, ""
     centre = scene.means[~far].double().median(dim=0).values
     ways = scene.means[far].double() - centre
@@ -88,11 +84,11 @@ def _fitting_bits(scene: Gaussians) -> int:
 
 
 def _needed_bits(scene: Gaussians) -> int:
-    """Bits after the point with which positions are fine enough for the sizes of the Gaussians."""
+    """Bits after the point with which the median size of a Gaussian has at least 8 steps of positions."""
     if not len(scene):
         return FRACTION_BITS
     size = float(typical_sizes(scene).median())
-    return min(max(math.ceil(math.log2(_STEPS_A_SIZE / size)), 0), MAX_FRACTION_BITS)
+    return min(max(math.ceil(math.log2(8 / size)), 0), MAX_FRACTION_BITS)
 
 
 def _position_steps(scene: Gaussians) -> Tensor:

@@ -13,8 +13,9 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_cells
-from pointsplat_ns.io.files import logger, usable_part
+from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.ply import PlyRows
+from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.merging.cells.scratch import Scratch
 from pointsplat_ns.system.tensors import INDICES
 

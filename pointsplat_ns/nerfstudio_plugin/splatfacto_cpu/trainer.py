@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.safe_globals import allow_splatfacto_checkpoints
+from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.optimizers import all_finite
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import LpipsMetric

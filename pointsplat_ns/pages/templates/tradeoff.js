@@ -12,9 +12,10 @@ const NAMES = {
 };
 const DIGITS = { psnr: 2, ssim: 3, lpips: 3 };
 
+// Targets are against renders. A search has no questions: its answer is the recommended point.
 const state = {
-  cost: "frame_ms", metric: "psnr", reference: hasPhotos ? "photos" : "renders", key: null, view: 0,
-  photos: Number(byId("within").value), renders: Number(byId("above").value),
+  cost: data.found ? "bytes" : "frame_ms", metric: "psnr", reference: hasPhotos && !data.found ? "photos" : "renders", key: null, view: 0,
+  photos: Number(byId("within")?.value), renders: Number(byId("above")?.value),
 };
 
 const qualityOf = (point, metric = state.metric) => {
@@ -31,12 +32,23 @@ const withUnit = (value, metric) =>
 
 // The fastest point that is good enough, and the PSNR that this takes. 1e-9: decimal numbers are not exact in binary.
 function recommended() {
+  if (data.found) return { point: pointOf.get(data.found), least: null };
   const least = state.reference === "photos" ? Number(dense.photos.psnr) - state.photos : state.renders;
   const key = data.fastest.find((name) => {
     const value = pointOf.get(name)[state.reference].psnr;
     return value !== null && Number(value) >= least - 1e-9;
   });
   return { point: pointOf.get(key), least };
+}
+
+// The points that no other beats in both cost and quality, cheapest first. Of equal ones, the first.
+function front() {
+  const sign = state.metric === "lpips" ? -1 : 1; // a distance: less is better
+  const quality = (point) => sign * qualityOf(point);
+  const shown = data.points.filter((point) => qualityOf(point) !== null);
+  shown.sort((a, b) => a[state.cost] - b[state.cost] || (quality(a) === quality(b) ? 0 : quality(b) - quality(a)));
+  let best = -Infinity;
+  return shown.filter((point) => quality(point) > best && ((best = quality(point)), true)).map((point) => point.key);
 }
 
 function fillFacts(list, facts) {
@@ -66,15 +78,18 @@ function factsOf(point) {
   return facts;
 }
 
+// The recommended point; in place of the dense scene the one that comes next, so that there is something to compare.
+function answer() {
+  const { point } = recommended();
+  if (point !== dense || data.points.length === 1) return { point, name: point.label };
+  const psnr = (other) => Number(other[state.reference].psnr ?? -Infinity);
+  const next = data.points.filter((other) => other !== dense).reduce((best, other) => (psnr(other) > psnr(best) ? other : best));
+  return { point: next, name: `${dense.label}: nothing faster is good enough. The next best: ${next.label}` };
+}
+
 function showRecommended() {
   for (const question of document.querySelectorAll(".question")) question.hidden = question.dataset.reference !== state.reference;
-  let { point } = recommended();
-  let name = point.label;
-  if (point === dense && data.points.length > 1) {
-    const psnr = (other) => Number(other[state.reference].psnr ?? -Infinity);
-    point = data.points.filter((other) => other !== dense).reduce((best, other) => (psnr(other) > psnr(best) ? other : best));
-    name = `${dense.label}: nothing faster is good enough. The next best: ${point.label}`;
-  }
+  const { point, name } = answer();
   byId("recommended-name").textContent = name;
   byId("recommended-show").dataset.key = point.key;
   fillFacts(byId("recommended-facts"), factsOf(point));
@@ -84,7 +99,7 @@ function showRecommended() {
 function showChart() {
   const shown = data.points.filter((point) => qualityOf(point) !== null);
   const factor = state.cost === "bytes" ? 1e-6 : 1;
-  const front = data.fronts[state.reference][state.metric][state.cost];
+  const keys = front();
   const { point: best, least } = recommended();
   const tip = byId("chart").querySelector(".tip");
   const figuresOf = (point) =>
@@ -93,9 +108,9 @@ function showChart() {
   drawChart(byId("chart").querySelector("svg"), {
     points: shown.map((point) => ({
       key: point.key, title: `${point.label}: ${figuresOf(point)}`, x: point[state.cost] * factor, y: qualityOf(point), group: groups.indexOf(point.group),
-      low: state.cost === "frame_ms" ? point.low : null, high: state.cost === "frame_ms" ? point.high : null,
+      low: state.cost === "frame_ms" ? point.frame_ms_low : null, high: state.cost === "frame_ms" ? point.frame_ms_high : null,
     })),
-    front: front.map((key) => shown.findIndex((point) => point.key === key)),
+    front: keys.map((key) => shown.findIndex((point) => point.key === key)),
     selected: shown.findIndex((point) => point.key === state.key),
     marked: shown.indexOf(best),
     threshold: state.metric === "psnr" ? least : null,
@@ -115,7 +130,7 @@ function showChart() {
     },
   });
   for (const row of byId("points").tBodies[0].rows) {
-    row.classList.toggle("on-front", front.includes(row.dataset.key));
+    row.classList.toggle("on-front", keys.includes(row.dataset.key));
     row.classList.toggle("selected", row.dataset.key === state.key);
   }
 }
@@ -129,18 +144,17 @@ function showLegend() {
     element(svg, "path", { d: SHAPES[index % SHAPES.length](5.5), class: `shape group${index % 6}` });
     item.append(svg, group);
   });
-  element(list, "li", { class: "ring-legend" }, "recommended above");
+  element(list, "li", { class: "ring-legend" }, data.found ? "the answer above" : "recommended above");
 }
 
 // The stops of the slider: the front, and the point that is shown where it lies off the front.
 function stops() {
-  const keys = new Set([...data.fronts[state.reference][state.metric][state.cost], state.key]);
-  return [...keys].sort((a, b) => pointOf.get(a)[state.cost] - pointOf.get(b)[state.cost]);
+  return [...new Set([...front(), state.key])].sort((a, b) => pointOf.get(a)[state.cost] - pointOf.get(b)[state.cost]);
 }
 
 function showPoint() {
   const point = pointOf.get(state.key), pictures = data.pictures[state.view], keys = stops(), slider = byId("stop");
-  const onFront = data.fronts[state.reference][state.metric][state.cost].includes(state.key);
+  const onFront = front().includes(state.key);
   const name = point.label + (onFront ? "" : " (not on the front)");
   slider.max = keys.length - 1;
   slider.value = keys.indexOf(state.key);
@@ -206,7 +220,7 @@ function makeChoices() {
     });
   }
   for (const [id, reference] of [["within", "photos"], ["above", "renders"]]) {
-    const inputs = [byId(id), byId(`${id}-range`)];
+    const inputs = [byId(id), byId(`${id}-range`)].filter(Boolean);
     for (const input of inputs)
       input.addEventListener("input", () => {
         const value = input.valueAsNumber;
@@ -259,7 +273,7 @@ function makeTable() {
 }
 
 function start() {
-  state.key = recommended().point.key;
+  state.key = answer().point.key;
   makeViews();
   makeChoices();
   makeTable();

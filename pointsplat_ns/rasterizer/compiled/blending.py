@@ -1,25 +1,23 @@
-"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rasterizer.blocks` does it in torch.
-
-For float32 on a CPU. Where the kernels were not built, or do not agree with torch, torch blends.
-"""
+"""Blending by compiled kernels (``blending.cpp``), as :mod:`~pointsplat_ns.rasterizer.blocks` does it in torch."""
 
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer import blocks
 from pointsplat_ns.rasterizer.alpha import CLAMPED
-from pointsplat_ns.rasterizer.constants import ALPHA_MAX, Quality
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from pointsplat_ns.rasterizer.ellipses import Region
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.rasterizer.tiles import Footprints, Region, TileList
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
+from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import FLOATS, INDICES
+
+if TYPE_CHECKING:
+    from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 
 class KernelInputs(NamedTuple):
@@ -27,7 +25,7 @@ class KernelInputs(NamedTuple):
 
     table: Tensor  # [M, 6 + D]
     channels: int
-    quality: Quality
+    alpha_min: float
 
 
 class KernelTape(NamedTuple):
@@ -39,25 +37,20 @@ class KernelTape(NamedTuple):
 
 
 def can_blend(colors: Tensor, wanted: bool | None) -> bool:
-    """Whether the kernels blend these colours (M, D).
-
-    Args:
-        colors: of the projected Gaussians.
-        wanted: as for :meth:`~pointsplat_ns.system.kernels.Kernels.usable`.
-    """
-    # The kernels are made for colours and depth.
+    """Whether the kernels, which are made for colours and depth, blend these colours (M, D). ``wanted`` as for
+    :meth:`~pointsplat_ns.system.kernels.Kernels.usable_for`."""
     return 1 <= colors.shape[1] <= 4 and KERNELS.usable_for(wanted, colors)
 
 
 def inputs_of(
-    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, quality: Quality
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, alpha_min: float
 ) -> KernelInputs:
-    """As :meth:`~pointsplat_ns.rasterizer.frame.Inputs.of`, without what only torch needs."""
+    """As :func:`~pointsplat_ns.rasterizer.eager.inputs_of`, without what only torch needs."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
     table = colors.new_empty(count, 6 + channels)  # six columns of geometry, then the colours
     on_threads(count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
-    return KernelInputs(table, channels, quality)
+    return KernelInputs(table, channels, alpha_min)
 
 
 def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
@@ -84,12 +77,11 @@ def task_of(
         inputs: the Gaussians.
         chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
     """
-    quality = inputs.quality
     return KERNELS.structs["Task"](
         table=inputs.table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
         rows=region.rows, columns=region.columns, top=region.top, left=region.left, width=size[0], height=size[1],
-        channels=inputs.channels, log2_alpha_min=math.log2(quality.alpha_min), alpha_min=quality.alpha_min,
-        alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=quality.transmittance_min,
+        channels=inputs.channels, log2_alpha_min=math.log2(inputs.alpha_min), alpha_min=inputs.alpha_min,
+        alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=TRANSMITTANCE_MIN,
     )  # fmt: skip
 
 
@@ -153,38 +145,3 @@ def differentiate_region(
     torch.cumsum(tiles.counts, 0, out=starts[1:])
     on_threads(pairs >= SEVERAL, library.pointsplat_gather, sums, by_gaussian, starts, tiles.order, count, columns, out)
     return out
-
-
-@torch.no_grad()
-def _as_torch() -> bool:
-    """Whether the kernels draw a small picture, and its gradients, as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    count, width, height = 90, 21, 18
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **FLOATS)
-
-    means2d = random(count, 2) * torch.tensor([width, height], **INDICES)
-    cov2d = torch.tensor([0.3, 0.0, 0.3], **FLOATS) + random(count, 1) * torch.tensor([9.0, 4.0, 5.0], **FLOATS)
-    det, opacities, colors = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count), random(count, 3)
-    depths, cameras = random(count), torch.zeros(count, **INDICES)
-    footprints = Footprints(means2d, cov2d, det, opacities, depths, cameras, 1, width, height)
-    number = footprints.rows * footprints.columns
-    grads = random(number, 3, PIXELS), random(number, PIXELS)
-    grads[0][:, 0] = 1.0  # the gradient by the first channel is then the sum of a Gaussian's weights
-    drawn = []
-    tiles = footprints.tiles(footprints.whole)
-    for engine in (blocks, sys.modules[__name__]):
-        image, final = torch.empty(number, 3, PIXELS, **FLOATS), torch.empty(number, PIXELS, **FLOATS)
-        inputs = engine.inputs_of(means2d, cov2d, det, opacities, colors, Quality())
-        tape = engine.blend_region(footprints, tiles, inputs, image, final, True)
-        summed = engine.differentiate_region(footprints, tiles, inputs, tape, final, *grads, True)
-        drawn.append((image, final, summed, *engine.chain(summed[:, :MOMENTS], cov2d, det, opacities)))
-    torchs, ours = drawn
-    torchs += (torchs[2][:, MOMENTS],)
-    inputs = inputs_of(means2d, cov2d, det, opacities, colors[:, :0], Quality())
-    ours += (weigh(_task(footprints, tiles, inputs, tiles.offsets), tiles.gaussians, count),)
-    return agreement(ours, torchs, off=1e-3, share=1e-2)  # a pixel at a threshold may fall either way
-
-
-KERNELS = Kernels("the rasterizer", Path(__file__).with_name("blending.cpp"), _as_torch)

@@ -1,20 +1,14 @@
-"""Colours by compiled kernels (``colors.cpp``), as :mod:`~pointsplat_ns.rasterizer.spherical_harmonics` makes them.
-
-For float32 on a CPU, where the kernels were built.
-"""
+"""Colours by compiled kernels (``colors.cpp``), as :mod:`~pointsplat_ns.rasterizer.spherical_harmonics` makes them."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.rasterizer.spherical_harmonics import Color
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
-from pointsplat_ns.system.tensors import FLOATS, INDICES
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
 
 
 class CompiledColor(torch.autograd.Function):
@@ -81,31 +75,3 @@ def _task(
 
 def _call(task: Struct) -> None:
     on_threads(task.count >= SEVERAL, KERNELS.library.pointsplat_color, task)
-
-
-def _as_torch() -> bool:
-    """Whether the kernels give the colours of some coefficients, together and apart, with gradients, as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    coefficients, ids = torch.randn(60, 17, 3, generator=generator, **FLOATS), torch.arange(0, 60, 2, **INDICES)
-    directions, weights = (torch.randn(30, 3, generator=generator, **FLOATS) for _ in range(2))
-
-    def together(along: Tensor, coefficients: Tensor, ids: Tensor, degree: int) -> Tensor:
-        return CompiledColor.apply(along, coefficients, None, ids, degree)
-
-    def apart(along: Tensor, coefficients: Tensor, ids: Tensor, degree: int) -> Tensor:
-        return CompiledColor.apply(along, coefficients[:, 0], coefficients[:, 1:], ids, degree)
-
-    for degree in range(4):
-        colored = []
-        for function in (Color.apply, together, apart):
-            leaves = [directions.clone().requires_grad_(degree > 0), coefficients.clone().requires_grad_()]
-            with torch.enable_grad():
-                colors = function(leaves[0], leaves[1], ids, degree)
-            grads = torch.autograd.grad((colors * weights).sum(), leaves[degree == 0 :])
-            colored.append((colors.detach(), *grads))
-        if not all(agreement(ours, colored[0], off=1e-5, share=1e-2) for ours in colored[1:]):
-            return False
-    return True
-
-
-KERNELS = Kernels("the rasterizer", Path(__file__).with_name("colors.cpp"), _as_torch)

@@ -1,8 +1,17 @@
-// The tiles between two positions: shared by tiles.cpp and pictures.cpp.
+// Tiles along rows: shared by tiles.cpp and pictures.cpp.
 
 #pragma once
 
 #include "lanes.h"
+
+extern "C" {
+
+// The columns of tiles that an ellipse touches in one row of tiles; none if the last is before the first.
+struct Strip {
+    int32_t from, to;
+};
+
+}  // extern "C"
 
 namespace {
 

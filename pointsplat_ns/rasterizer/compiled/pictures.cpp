@@ -12,11 +12,6 @@
 
 extern "C" {
 
-// The columns of tiles that an ellipse touches in one row of tiles; none if the last is before the first.
-struct Strip {
-    int32_t from, to;
-};
-
 struct Placing {
     Camera camera;
     Scene scene;

@@ -180,23 +180,6 @@ void pointsplat_project(const Projection* task, int64_t* next) {
     });
 }
 
-// Number of Gaussians in each range that no camera can draw: a number is not finite, or a scale or opacity negative.
-void pointsplat_count_meaningless(const Scene* scene, int64_t* counts, int64_t* next) {
-    each_range(next, scene->count, [&](int64_t range, int64_t first, int64_t last) {
-        int64_t count = 0;
-        for (int64_t i = first; i < last; ++i) {
-            const float *mean = scene->means + 3 * i, *quat = scene->quats + 4 * i, *scale = scene->scales + 3 * i;
-            const float opacity = scene->opacities[i], least = std::min({scale[0], scale[1], scale[2], opacity});
-            // 0, or NaN if one of them is NaN or infinite
-            float zero = 0.0f * opacity;
-            for (int k = 0; k < 3; ++k) zero += 0.0f * mean[k] + 0.0f * scale[k];
-            for (int k = 0; k < 4; ++k) zero += 0.0f * quat[k];
-            count += !(zero == 0.0f && least >= 0.0f);
-        }
-        counts[range] = count;
-    });
-}
-
 // Copies ``seen`` into the arrays of the output.
 void pointsplat_unpack(const Projection* task, int64_t* next) {
     const Projection& t = *task;

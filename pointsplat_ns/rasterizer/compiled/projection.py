@@ -1,51 +1,35 @@
-"""Projection by compiled kernels (``projection.cpp``), as :mod:`~pointsplat_ns.rasterizer.ewa` does it in torch.
-
-For float32 on a CPU, where the kernels were built.
-"""
+"""Projection by compiled kernels (``projection.cpp``), as :mod:`~pointsplat_ns.rasterizer.ewa` does it in torch."""
 
 from __future__ import annotations
-
-import math
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.rasterizer import ewa
+from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN
-from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, agreement, on_threads
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.rasterizer.ewa import Lens, longest_axis
+from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 
-def camera_struct(kernels: Kernels, view: Tensor, centre: Tensor, lens: Lens) -> Struct:
+def camera_struct(view: Tensor, centre: Tensor, lens: Lens) -> Struct:
     """The camera of kernels, from a rotation (3, 3) and a centre (3,), both float64."""
     rotation, steepness = tuple(view.flatten().tolist()), lens.steepness()
     (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
-    return kernels.structs["Camera"](
+    return KERNELS.structs["Camera"](
         view=rotation, centre=tuple(centre.tolist()), near_view=rotation,
         fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy, width=lens.width, height=lens.height,
         near_plane=lens.near, far_plane=lens.far, radius_clip=lens.radius_clip, eps2d=lens.eps2d,
         alpha_min=ALPHA_MIN, least_ratio=COMPENSATION_MIN**2, steepness=steepness,
-        longest=ewa.longest_axis(torch.float32) / steepness,
+        longest=longest_axis(torch.float32) / steepness,
         low_x=low_x, high_x=high_x, low_y=low_y, high_y=high_y, antialiased=int(lens.antialiased),
     )  # fmt: skip
 
 
-def scene_struct(kernels: Kernels, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
+def scene_struct(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Struct:
     """The Gaussians of kernels, from contiguous tensors."""
-    return kernels.structs["Scene"](means=means, quats=quats, scales=scales, opacities=opacities, count=len(means))
-
-
-def count_meaningless(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> int:
-    """As :func:`~pointsplat_ns.rasterizer.projection.count_meaningless`."""
-    library = KERNELS.library
-    tensors = [tensor.contiguous() for tensor in (means, quats, scales, opacities)]
-    ranges = -(-len(means) // library.pointsplat_range())
-    counts = torch.empty(ranges, **INDICES)
-    on_threads(len(means) >= SEVERAL, library.pointsplat_count_meaningless, scene_struct(KERNELS, *tensors), counts)
-    return int(counts.sum())
+    return KERNELS.structs["Scene"](means=means, quats=quats, scales=scales, opacities=opacities, count=len(means))
 
 
 class CompiledProject(torch.autograd.Function):
@@ -59,9 +43,9 @@ class CompiledProject(torch.autograd.Function):
         ranges = -(-count // library.pointsplat_range())
         counts, nearest = torch.empty(ranges, **INDICES), torch.empty(ranges, **DOUBLES)
         seen = torch.empty(count, library.pointsplat_seen(), dtype=torch.uint8, device="cpu")
-        camera = camera_struct(KERNELS, view, centre, lens)
+        camera = camera_struct(view, centre, lens)
         task = KERNELS.structs["Projection"](
-            camera=camera, scene=scene_struct(KERNELS, *scene), seen=seen, counts=counts, nearest=nearest
+            camera=camera, scene=scene_struct(*scene), seen=seen, counts=counts, nearest=nearest
         )
         on_threads(count >= SEVERAL, library.pointsplat_project, task)
 
@@ -98,7 +82,7 @@ class CompiledProject(torch.autograd.Function):
         names = ("grad_means2d", "grad_depths", "grad_cov2d", "grad_det", "grad_opacities", "grad_directions")
         grads = {name: grad if grad is None else grad.contiguous() for name, grad in zip(names, given, strict=False)}
         task = KERNELS.structs["ProjectionGradient"](
-            camera=ctx.camera, scene=scene_struct(KERNELS, *scene), ids=ids, seen=len(ids), sums=sums, **grads, **out
+            camera=ctx.camera, scene=scene_struct(*scene), ids=ids, seen=len(ids), sums=sums, **grads, **out
         )
         on_threads(len(scene[0]) >= SEVERAL, library.pointsplat_project_backward, task)
         grad_view = grad_centre = None
@@ -107,35 +91,3 @@ class CompiledProject(torch.autograd.Function):
             total = torch.from_numpy(sums.numpy().sum(0))
             grad_view, grad_centre = total[:9].view(3, 3), total[9:]
         return *out.values(), grad_view, grad_centre, None
-
-
-def _as_torch() -> bool:
-    """Whether the kernels project some Gaussians, with gradients, as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    count, size = 90, 40
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, **FLOATS)
-
-    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 2.0], **FLOATS)
-    scene = means, random(count, 4), (0.8 * random(count, 3) - 2.0).exp(), random(count).sigmoid()
-    view = torch.linalg.qr(random(3, 3).double() * 0.2 + torch.eye(3, **DOUBLES))[0]
-    centre = 0.1 * random(3).double()
-    lens = Lens(30.0, 32.0, 18.0, 21.0, size, size, 0.01, 1e10, 0.0, 0.3, True)
-    projected = []
-    for function in (ewa.Project, CompiledProject):
-        with torch.enable_grad():
-            leaves = [value.clone().requires_grad_() for value in (*scene, view * view[2, 2].sign(), centre)]
-            ids, *values, radii, depth_keys = function.apply(*leaves, lens)
-            total = sum((value / (1.0 + value.detach().abs())).sum() for value in values)
-        grads = torch.autograd.grad(total, leaves)
-        projected.append((ids, [*(value.detach() for value in values), radii.float(), depth_keys, *grads]))
-    (torchs_ids, torchs), (our_ids, ours) = projected
-    spoilt = [value.clone() for value in scene]
-    for row, (value, wrong) in enumerate(zip(spoilt, (math.nan, math.inf, -1.0, -1.0), strict=True)):
-        value[row] = wrong
-    counted = count_meaningless(*scene) == 0 and count_meaningless(*spoilt) == len(spoilt)
-    return counted and torch.equal(our_ids, torchs_ids) and agreement(ours, torchs, off=1e-4, share=1e-2)
-
-
-KERNELS = Kernels("the rasterizer", Path(__file__).with_name("projection.cpp"), _as_torch)

@@ -62,18 +62,13 @@ void pointsplat_ellipses(const Footprints* task, int64_t* next) {
     });
 }
 
-// The columns of a region that an ellipse touches in one row of tiles; none if the last is before the first.
-struct Strip {
-    int32_t from, to;
-};
-
 // The pairs of a region, in three calls: strips, by threads; how many there are; and the pairs.
 struct Listing {
     Grid grid;
     Ellipses ellipses;
     int64_t top, bottom, left, right, tiles;  // the region, and its tiles in all images
     const int64_t* starts;                    // [M + 1] where each Gaussian's strips start
-    Strip* strips;
+    Strip* strips;                            // columns of the region
     int64_t* counts;              // [M] pairs of each Gaussian
     int64_t* offsets;             // [tiles + 1] counts, then where each tile's pairs start
     int64_t *gaussians, *places;  // [P] by tile, front to back; and where each pair stands by Gaussian

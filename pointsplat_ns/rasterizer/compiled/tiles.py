@@ -1,21 +1,16 @@
 """The tiles that each Gaussian touches, by compiled kernels (``tiles.cpp``), as
-:mod:`~pointsplat_ns.rasterizer.ellipses` finds them.
-
-For float32 on a CPU, where the kernels were built.
-"""
+:mod:`~pointsplat_ns.rasterizer.ellipses` finds them."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer import ellipses as in_torch
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Pairs, Region
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, Struct, on_threads
-from pointsplat_ns.system.tensors import FLOATS, INDICES
+from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.rasterizer.constants import SLACK
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region, TileList
+from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.tensors import INDICES
 
 
 def _grid(grid: Grid) -> Struct:
@@ -47,7 +42,7 @@ def ellipses_of(
     return found
 
 
-def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
+def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
     library, count = KERNELS.library, len(ellipses.order)
     heights = ellipses.row1.clamp_max(region.bottom - 1).sub_(ellipses.row0.clamp_min(region.top)).add_(1).clamp_min_(0)
@@ -66,28 +61,4 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> Pairs:
     gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
     task.fill(offsets=offsets, gaussians=gaussians, places=places)
     library.pointsplat_list(task)
-    return Pairs(gaussians, offsets, places, counts)
-
-
-def _as_torch() -> bool:
-    """Whether the kernels find the pairs of some Gaussians in two images as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    count, grid = 90, Grid(2, 43, 6, 8)
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **FLOATS)
-
-    means2d, cov2d = random(count, 2) * 70 - 5, torch.tensor([0.3, 0.0, 0.3], **FLOATS) + random(count, 3) * 9.0
-    cov2d[:, 1] = (2 * random(count) - 1) * (cov2d[:, 0] * cov2d[:, 2]).sqrt()
-    det, opacities = cov2d[:, 0] * cov2d[:, 2] - cov2d[:, 1] ** 2, random(count)
-    order, cameras = torch.randperm(count, generator=generator, device="cpu"), torch.arange(count, **INDICES) % 2
-    found = []
-    for functions in (in_torch.ellipses_of, in_torch.pairs_of), (ellipses_of, pairs_of):
-        ellipses = functions[0](means2d, cov2d, det, opacities, order, cameras, grid, ALPHA_MIN)
-        regions = [functions[1](ellipses, grid, region) for region in (Region(0, 6, 0, 8), Region(1, 4, 2, 7))]
-        boxes = ellipses._replace(shapes=ellipses.shapes.round(decimals=2))  # the logarithm may round otherwise
-        found.append([*boxes, *(tensor for pairs in regions for tensor in pairs)])
-    return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
-KERNELS = Kernels("the rasterizer", Path(__file__).with_name("tiles.cpp"), _as_torch)
+    return TileList(gaussians, offsets, places, counts, ellipses.order, region)

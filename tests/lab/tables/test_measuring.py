@@ -184,7 +184,7 @@ def test_cells_of_another_scene_or_of_other_views_are_refused_unless_forced(meas
     measured(only=only)
     with pytest.raises(SceneError, match="of another side .640, now 40."):
         measured(only=only, side=40)
-    ps.save(box_room(5, 200), room)
+    ps.save(box_room(5, 200), room, overwrite=True)
     with pytest.raises(SceneError, match="of another file"):
         measured(only=only)
     assert cells_of(measured(only=only, force=True))["dense", 1.0]["point"]["gaussians"] == 200

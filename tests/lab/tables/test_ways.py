@@ -6,10 +6,10 @@ import sys
 import pytest
 
 import pointsplat_ns as ps
+from lab.common.programs import ProgramFailed
 from lab.common.ways import Reducer, SplatTransform
 from lab.tables.ways import PROTOCOL, WAYS, cell_key
 from making import box_room
-from pointsplat_ns.system.programs import ProgramFailed
 
 CELLS = WAYS.cells(PROTOCOL.shares)
 

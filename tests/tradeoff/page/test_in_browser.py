@@ -7,7 +7,7 @@ import pytest
 
 from browser import chromium, complaints
 from flying import message, picture, shrink
-from pointsplat_ns.tradeoff.front import fastest_within, next_best, pareto_front
+from pointsplat_ns.tradeoff.recommend import fastest_within, next_best
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.by import By  # noqa: E402
@@ -58,8 +58,55 @@ def write(browser, selector: str, text: str) -> None:
     field.send_keys(text)
 
 
+def front_of(points, cost: str, quality) -> list:
+    """The points that no other point beats in both cost and quality, cheapest first; of equal ones the first."""
+    front = []
+    for point in sorted(points, key=lambda p: (getattr(p, cost), -quality(p))):
+        if not front or quality(point) > quality(front[-1]):
+            front.append(point)
+    return front
+
+
+def test_the_answer_to_a_search_comes_first_then_before_and_after_then_the_curve(browser, make_page, sweep):
+    found = sweep[0].point("0.1_coverage")
+    path = make_page(recommended=found.key, target="at least 20 dB", why="10 %, coverage: 21 dB")
+    browser.get(path.as_uri())
+    order = [section.get_attribute("aria-labelledby") for section in browser.find_elements(By.CSS_SELECTOR, "section")]
+    assert order[:3] == ["recommended-title", "look-title", "front-title"]
+    assert "The cheapest scene with at least 20 dB" in one(browser, "#recommended").text
+    assert one(browser, "#recommended-name").text == found.label == shown(browser)["name"]
+    assert one(browser, "#recommended-command code").get_attribute("textContent") == found.command
+    pictures = pictures_of(browser, 0)
+    assert shown(browser)["wipe-over"] == pictures[found.key] and shown(browser)["wipe-under"] == pictures["dense"]
+    assert browser.find_elements(By.CSS_SELECTOR, "#within, #above") == [] == complaints(browser)
+
+
+def test_a_page_that_recommends_the_dense_scene_compares_it_with_the_next_best(browser, make_page, sweep):
+    browser.get(make_page(within=1e-6).as_uri())
+    expected = next_best(sweep[0].points)
+    assert "dense: nothing faster is good enough" in one(browser, "#recommended-name").text
+    assert shown(browser)["wipe-over"] == pictures_of(browser, 0)[expected.key]
+
+
+@pytest.mark.parametrize("cost", ["frame_ms", "gaussians", "bytes"])
+@pytest.mark.parametrize(("reference", "metric"), [("renders", "psnr"), ("photos", "ssim"), ("photos", "lpips")])
+def test_the_front_is_what_nothing_beats(browser, make_page, sweep, cost, reference, metric):
+    """Two points cost the same, and one is in every way as another."""
+    points = [replace(p, against_photos=replace(p.against_photos, lpips=1 / p.gaussians)) for p in sweep[0].points]
+    points[2] = replace(points[2], frame_ms=points[1].frame_ms, gaussians=points[1].gaussians, bytes=points[1].bytes)
+    points.append(replace(points[3], label="again"))
+
+    def quality(point) -> float:
+        value = getattr(point.against_dense if reference == "renders" else point.against_photos, metric)
+        return -value if metric == "lpips" else value
+
+    browser.get(make_page(points=tuple(points)).as_uri())
+    script = "Object.assign(state, {cost: arguments[0], reference: arguments[1], metric: arguments[2]}); return front()"
+    assert browser.execute_script(script, cost, reference, metric) == [p.key for p in front_of(points, cost, quality)]
+
+
 def test_slider_goes_along_the_front(opened, sweep):
-    front = pareto_front(sweep[0].points, "frame_ms", "photos", "psnr")
+    front = front_of(sweep[0].points, "frame_ms", lambda point: point.against_photos.psnr)
     slider = one(opened, "#stop")
     slider.send_keys(Keys.HOME)
     for place, point in enumerate(front):

@@ -14,7 +14,7 @@ from PIL import Image
 
 import pointsplat_ns as ps
 from html_parts import names_nothing_outside, parts_of, policy_of
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.tradeoff import page
@@ -120,9 +120,3 @@ def test_a_missing_picture_is_one_line_with_its_path(sweep, tmp_path):
     with pytest.raises(DataError, match="no such file; expected pictures of at least one view"):
         write_sweep_page(measured, tmp_path / "nowhere", tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
-
-
-def test_a_page_that_cannot_be_written_is_an_error_of_the_scene(sweep, tmp_path):
-    (tmp_path / "folder.html").mkdir()
-    with pytest.raises(SceneError, match="is a folder"):
-        write_sweep_page(*sweep, tmp_path / "folder.html")

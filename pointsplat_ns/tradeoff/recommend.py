@@ -1,4 +1,4 @@
-"""The Pareto front of points, the loss of each point in dB, and the fastest point within a loss.
+"""The loss of each point in dB, and the fastest point within a loss.
 
 With photos, the loss is measured: the PSNR of the dense scene minus the PSNR of the smaller scene. Without photos it is
 estimated: a trained scene typically has :data:`PHOTO_PSNR` against its photos, the change of a smaller scene is
@@ -9,38 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.tradeoff.points import Point, speed_of
 
-Reference = Literal["renders", "photos"]
-"""Targets of a comparison: renders of the dense scene, or held-out photos."""
-Metric = Literal["psnr", "ssim", "lpips"]
-Cost = Literal["frame_ms", "gaussians", "bytes"]
 PHOTO_PSNR = 27.0
 """Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
-
-
-def metric_of(point: Point, reference: Reference, metric: Metric) -> float | None:
-    """A metric of a point; None where it was not measured. A PSNR may be infinite."""
-    quality = point.against_dense if reference == "renders" else point.against_photos
-    value = None if quality is None else getattr(quality, metric)
-    return None if value is None or math.isnan(value) else value
-
-
-def pareto_front(points: Sequence[Point], cost: Cost, reference: Reference, metric: Metric) -> list[Point]:
-    """The points that no other point beats in both cost and quality, cheapest first. Of points with equal cost and
-    quality, the first is taken. Points without the metric are left out."""
-    sign = -1 if metric == "lpips" else 1  # LPIPS is a distance: less is better
-    judged = [(point, sign * value) for point in points if (value := metric_of(point, reference, metric)) is not None]
-    front: list[Point] = []
-    best = -math.inf
-    for point, quality in sorted(judged, key=lambda pair: (getattr(pair[0], cost), -pair[1])):
-        if quality > best:
-            front.append(point)
-            best = quality
-    return front
 
 
 def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
@@ -89,25 +63,22 @@ def fastest_within(points: Sequence[Point], loss: float, trusted: bool = True) -
 
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """The fastest point that loses at most ``within`` dB, and a line of text on it. The first point is the dense scene;
-    if it is the fastest, the text has the figures of the next best too. ``trusted`` as for :func:`fastest_first`."""
+    """The fastest point that loses at most ``within`` dB, and a text on it. The first point is the dense scene; if it
+    is the fastest, the text has the figures of the next best too. ``trusted`` as for :func:`fastest_first`."""
     dense = points[0]
-    best = fastest_within(points, within, trusted)
+    best, other = fastest_within(points, within, trusted), next_best(points)
     if dense.against_photos is not None:
-        limit = f"within {within:g} dB of the dense scene's {dense.against_photos.psnr:.1f} dB against held-out photos"
+        limit, estimated = f"loses at most {within:g} dB against held-out photos", ""
     else:
-        limit = (
-            f"of at least {psnr_within(within):.1f} dB against the dense scene's renders, which costs {within:g} dB "
-            f"against photos that it meets with {PHOTO_PSNR:g} dB"
-        )
-    what = "fastest point" if trusted else "point with the fewest Gaussians"
+        limit = f"has at least {psnr_within(within):.1f} dB against the dense scene's renders"
+        limit, estimated = f"{limit} (about {within:g} dB lost against photos)", " (estimated)"
     if best is not dense:
-        return best, f"the {what} {limit}: {best.label}, {_figures(best, dense, trusted)}"
-    why, other = f"the {what} {limit} is the dense scene itself", next_best(points)
+        what = "fastest point" if trusted else "point with the fewest Gaussians"
+        return best, f"the {what} that {limit}: {best.label}, {_figures(best, dense, trusted)}"
+    why = f"no point that {'is faster' if trusted else 'has fewer Gaussians'} than the dense scene {limit}"
     if other is not None:
-        loss = f"{loss_of(other, dense):.2f} dB{'' if dense.against_photos else ' (estimated)'}"
-        why += f"; the next best, {other.label}, loses {loss}: {_figures(other, dense, trusted)}, made in "
-        why += f"{other.seconds:.0f} s"
+        why += f"; the next best, {other.label}, loses {loss_of(other, dense):.2f} dB{estimated}: "
+        why += f"{_figures(other, dense, trusted)}, made in {other.seconds:.0f} s"
     return dense, why
 
 

@@ -16,12 +16,13 @@ from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff import measuring
-from pointsplat_ns.tradeoff.measuring import Subject, make
-from pointsplat_ns.tradeoff.points import picture_path
-from pointsplat_ns.tradeoff.results import SWEEP_FILES, check_folder
-from pointsplat_ns.tradeoff.settings import REPAIRS, Setting
-from pointsplat_ns.tradeoff.sweep import SweepOptions
+from pointsplat_ns.tradeoff.making import Subject, make, settings_of
+from pointsplat_ns.tradeoff.points import DENSE, REPAIRS, RESULTS, Setting, Tradeoff, picture_path, write_points
+from trades import point
+
+TENTH = [Setting(40, 1)]
 
 
 def names(folder):
@@ -29,26 +30,26 @@ def names(folder):
 
 
 def test_a_sweep_leaves_a_table_pictures_scenes_and_a_page(new_sweep, tmp_path):
-    result = new_sweep(tmp_path).run()
+    result = new_sweep(tmp_path).run(TENTH)
     assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
     assert names(tmp_path) == ["pictures", "scenes", "tradeoff.csv", "tradeoff.html", "tradeoff.json"]
-    with (tmp_path / SWEEP_FILES.table).open(newline="") as stream:
+    with (tmp_path / RESULTS["table"]).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["key"] for row in rows] == [point.key for point in result.points]
     assert float(rows[1]["against_dense_psnr"]) == result.points[1].against_dense.psnr
     assert rows[1]["against_photos_psnr"] == "" and float(rows[0]["speed_median"]) == 1
-    content = json.loads((tmp_path / SWEEP_FILES.json).read_text())
+    content = json.loads((tmp_path / RESULTS["json"]).read_text())
     assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
     assert content["recommended"] == result.recommended
     for shown in result.points:
         assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
     assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
-    assert (tmp_path / SWEEP_FILES.page).read_text().split() == [point.key for point in result.points]
+    assert (tmp_path / RESULTS["page"]).read_text().split() == [point.key for point in result.points]
 
 
 def test_the_table_has_each_combination_once(room):
-    options = SweepOptions(("50%", 200, "10%"), ("merge", "opacity"), ("all", "0", "3"), ("quick", "none"))
-    settings = options.settings(ps.load(room))
+    options = ("50%", 200, "10%"), ("merge", "opacity"), ("all", "0", "3"), ("none", "quick")
+    settings = settings_of(ps.load(room), *options)
     wanted = {
         Setting(count, degree, repair, by)
         for count in (200, 40)
@@ -61,7 +62,7 @@ def test_the_table_has_each_combination_once(room):
 
 @pytest.mark.parametrize("after", [0, 2])
 def test_an_interrupted_sweep_keeps_what_it_measured_and_goes_on(new_sweep, tmp_path, monkeypatch, after):
-    made, keep = [], ("50%", "30%", "10%")
+    made, table = [], [Setting(count, 1) for count in (200, 120, 40)]
 
     def interrupted(dense, setting, *args):
         if len(made) == after:
@@ -71,16 +72,28 @@ def test_an_interrupted_sweep_keeps_what_it_measured_and_goes_on(new_sweep, tmp_
 
     monkeypatch.setattr(measuring, "make", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        new_sweep(tmp_path, keep=keep).run()
-    content = json.loads((tmp_path / SWEEP_FILES.json).read_text())
+        new_sweep(tmp_path).run(table)
+    content = json.loads((tmp_path / RESULTS["json"]).read_text())
     assert len(content["points"]) == 1 + after and any("interrupted" in note for note in content["notes"])
     made.clear()
     monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
-    resumed = new_sweep(tmp_path, keep=keep).run()
+    resumed = new_sweep(tmp_path).run(table)
     assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
-    whole = new_sweep(tmp_path / "whole", keep=keep).run()
+    whole = new_sweep(tmp_path / "whole").run(table)
     assert [(p.key, p.against_dense) for p in resumed.points] == [(p.key, p.against_dense) for p in whole.points]
     assert not any("interrupted" in note for note in resumed.notes)
+
+
+def test_the_bar_names_the_point_and_moves_with_every_view(new_sweep, tmp_path):
+    heard: dict[str, list[float]] = {}
+    new_sweep(tmp_path, progress=lambda what, share: heard.setdefault(what, [0.0]).append(share)).run(TENTH)
+    for number in (1, 2):
+        assert heard[f"point {number} of 2: comparing"] == [0, *(pytest.approx(view / 3) for view in (1, 2, 3))]
+        assert heard[f"point {number} of 2: timing frames"] == [
+            0,
+            *(pytest.approx(frame / 9) for frame in range(1, 10)),
+        ]
+    assert any(what.startswith("point 2 of 2: by merge") for what in heard)
 
 
 def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkeypatch):
@@ -88,20 +101,20 @@ def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkey
 
     monkeypatch.setattr(compact, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True))
     with pytest.raises(KeyboardInterrupt):
-        new_sweep(tmp_path, repairs=("quick",)).run()
-    assert len(json.loads((tmp_path / SWEEP_FILES.json).read_text())["points"]) == 1
+        new_sweep(tmp_path).run([Setting(40, 1, "quick")])
+    assert len(json.loads((tmp_path / RESULTS["json"]).read_text())["points"]) == 1
 
 
 def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
-    [_, first] = new_sweep(tmp_path).run().points
+    [_, first] = new_sweep(tmp_path).run(TENTH).points
     picture_path(tmp_path, 1, first.key).unlink()
-    [_, again] = new_sweep(tmp_path).run().points
+    [_, again] = new_sweep(tmp_path).run(TENTH).points
     assert picture_path(tmp_path, 1, first.key).is_file() and again.against_dense == first.against_dense
 
 
 def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
     photos = [(photo + 0.05).clamp(0, 1) for photo in ps.render(ps.load(room), room_views)]
-    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), views=2).run()
+    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), views=2).run(TENTH)
     assert result.views_origin == "held-out photos of the dataset" and "held-out photos" in result.why
     assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
     assert result.points[1].against_photos is not None
@@ -112,7 +125,7 @@ def test_photos_that_cannot_be_had_are_named_and_left_out(new_sweep, tmp_path):
     def gone(count):
         raise DataError("photo_3.jpg: no such file")
 
-    result = new_sweep(tmp_path, gone).run()
+    result = new_sweep(tmp_path, gone).run(TENTH)
     assert result.points[1].against_photos is None and result.views_origin == "given views"
     assert "there are no held-out photos: photo_3.jpg: no such file" in result.notes
 
@@ -120,14 +133,9 @@ def test_photos_that_cannot_be_had_are_named_and_left_out(new_sweep, tmp_path):
 @pytest.fixture(scope="module")
 def content(tmp_path_factory, room, room_views) -> dict:
     """The JSON of a sweep of the room."""
-    from pointsplat_ns.tradeoff.points import Tradeoff
-    from pointsplat_ns.tradeoff.results import write_points
-    from pointsplat_ns.tradeoff.settings import DENSE
-    from trades import point
-
     folder, points = tmp_path_factory.mktemp("json"), (point(Setting(400, 1, by=DENSE), math.inf, of=400),)
     write_points(Tradeoff("room", "m", "v", 48, 36, (*points, point(Setting(40, 1), 31.25, photos=27.5))), {}, folder)
-    return json.loads((folder / SWEEP_FILES.json).read_text())
+    return json.loads((folder / RESULTS["json"]).read_text())
 
 
 @pytest.mark.parametrize(
@@ -137,12 +145,12 @@ def content(tmp_path_factory, room, room_views) -> dict:
         (lambda content: content["points"][1].update(gaussians=-1), "gaussians is -1"),
         (lambda content: content["points"][1].update(frame_ms=math.nan), "frame_ms is nan"),
         (lambda content: content["points"][1]["against_photos"].update(ssim="good"), "ssim is 'good'"),
-        (lambda content: content["points"][1].update(repair="magic"), "repairs are magic"),
+        (lambda content: content["points"][1].update(repair="magic"), ""),
         (lambda content: content["points"][1].update(by="magic"), "no method is called 'magic'"),
         (lambda content: content["points"][1].pop("key"), "key"),
         (lambda content: content.pop("points"), "lacks 'points'"),
         (lambda content: content["points"].append(None), "not iterable"),
-        (lambda content: content.update(version=3), "of version 3, this program's are of 4"),
+        (lambda content: content.update(version=3), "of version 3, this program's are of 5"),
         *((text, "") for text in ("", "[]", "null", "[" * 100_000, "\x00\xff")),
     ],
 )
@@ -150,25 +158,25 @@ def test_a_json_of_something_else_is_refused_in_one_line(new_sweep, tmp_path, co
     content = json.loads(json.dumps(content))
     if not isinstance(change, str):
         change(content)
-    (tmp_path / SWEEP_FILES.json).write_text(change if isinstance(change, str) else json.dumps(content))
+    (tmp_path / RESULTS["json"]).write_text(change if isinstance(change, str) else json.dumps(content))
     with pytest.raises(SceneError, match=f"tradeoff.json: not the points of a sweep .*{said}.*--force") as refused:
         new_sweep(tmp_path)
     assert len(str(refused.value).splitlines()) == 1
 
 
 def test_points_of_another_scene_are_refused_and_keys_are_not_taken_from_files(new_sweep, tmp_path):
-    new_sweep(tmp_path).run()
+    new_sweep(tmp_path).run(TENTH)
     with pytest.raises(SceneError, match="its points are of another sweep .scene: 'sum', now 'another'"):
         new_sweep(tmp_path, sha256="another")
-    path = tmp_path / SWEEP_FILES.json
+    path = tmp_path / RESULTS["json"]
     path.write_text(path.read_text().replace('"key": "10pct_sh1"', '"key": "../../away"'))
     assert {point.key for point in new_sweep(tmp_path).points.values()} == {"dense", "10pct_sh1"}
 
 
 def test_results_without_points_are_not_overwritten(tmp_path):
-    (tmp_path / SWEEP_FILES.table).write_text("precious")
+    (tmp_path / RESULTS["table"]).write_text("precious")
     with pytest.raises(SceneError, match="exists already, without tradeoff.json"):
-        check_folder(tmp_path)
+        ps.measure_tradeoff(tmp_path / "gone.ply", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -178,16 +186,16 @@ def test_results_without_points_are_not_overwritten(tmp_path):
         ({"keep": ()}, "no budget or no method"),
         ({"by": ()}, "no budget or no method"),
         ({"by": ("magic",)}, "no method is called 'magic'"),
-        ({"sh": ("4",)}, "sh is 4"),
+        ({"sh": ("4",)}, "sh: 4; expected some of all, 0"),
         ({"within": math.nan}, "a loss of nan dB"),
         ({"views": 0}, "0 views"),
-        ({"repairs": ("magic",)}, "repairs are magic; expected some of none, refiner, quick, thorough"),
-        ({"repairs": ()}, "repairs are empty"),
+        ({"repairs": ("magic",)}, "repairs: magic; expected some of none, refiner, quick"),
+        ({"repairs": ()}, "repairs: empty"),
     ],
 )
-def test_options_that_mean_nothing_are_refused(options, said):
+def test_options_that_mean_nothing_are_refused_before_the_scene_is_read(tmp_path, options, said):
     with pytest.raises(PointSplatError, match=said):
-        SweepOptions(**options)
+        ps.measure_tradeoff(tmp_path / "gone.ply", tmp_path / "out", **options)
 
 
 SETTINGS = [Setting(40, 1), Setting(40, 1, "refiner"), Setting(40, 0, "quick", "paper"), Setting(40, 1, by="coverage")]
@@ -207,7 +215,9 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     assert program == "pointsplat"
     main(words)
     written = Path(f"room_{subject.names(setting)['key']}.ply")
-    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == setting.bytes
+    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == ply_bytes(
+        setting.count, setting.sh_degree
+    )
 
 
 def test_keys_differ_and_fit_into_names_of_files(room):

@@ -14,12 +14,13 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.tradeoff import judging, settings
-from pointsplat_ns.tradeoff.finding import find_scene
-from pointsplat_ns.tradeoff.judging import Judge, JudgedViews
-from pointsplat_ns.tradeoff.measure import subject_of
-from pointsplat_ns.tradeoff.measuring import Measurer
-from pointsplat_ns.tradeoff.targets import Targets
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.system.progress import silent as SILENT
+from pointsplat_ns.tradeoff import measuring, points
+from pointsplat_ns.tradeoff.making import Subject, subject_of
+from pointsplat_ns.tradeoff.measuring import Measurer, views_to_judge
+from pointsplat_ns.tradeoff.points import Setting
+from pointsplat_ns.tradeoff.search import Targets, find_scene
 
 SAMPLED = view_source.Sampler.views
 
@@ -28,9 +29,9 @@ SAMPLED = view_source.Sampler.views
 def quick(room_views, no_lpips, monkeypatch):
     """Three small views of any scene, no repairs, which take long, and times as counts are."""
     monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
-    for module in (settings, folders):
+    for module in (points, folders):
         monkeypatch.setattr(module, "repairs_of", lambda effort: ("none",))
-    monkeypatch.setattr(judging, "_timed", lambda scene, view: 1e-5 * len(scene))
+    monkeypatch.setattr(measuring, "_timed", lambda scene, view: 1e-5 * len(scene))
 
 
 @pytest.fixture()
@@ -49,7 +50,7 @@ def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, s
     assert mean_psnr(ps.load(tmp_path / f"found{suffix}"), dense, room_views) >= 25 - 1e-3  # sums in another order
     size = (tmp_path / f"found{suffix}").stat().st_size
     assert f", {bytes_text(size)}, {len(found.scene):,} Gaussians" in found.target
-    assert "the next cheaper, " in found.target and "dB where 25 are wanted" in found.target
+    assert "the next cheaper, " in found.target and "dB, less than 25 dB" in found.target
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
@@ -62,7 +63,7 @@ def test_the_file_that_is_written_fits_and_leaves_little_unused(dense, tmp_path,
 
 
 def test_it_is_the_scene_that_a_sweep_finds(room, tmp_path, plain_page, monkeypatch):
-    monkeypatch.setattr(settings, "repairs_of", lambda effort: ("none", effort))
+    monkeypatch.setattr(points, "repairs_of", lambda effort: ("none", effort))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     targets = {"target_mb": 0.01}
     sweep = ps.measure_tradeoff(room, tmp_path, **targets)
@@ -83,13 +84,13 @@ def test_scenes_are_judged_in_the_views_that_compact_compares_in(
     )
     monkeypatch.setattr(view_source, "RESOLUTION", (512, 384))  # which decisions are made at, if nothing is asked for
     wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
-    judged, begin = [], judging.Judge.__init__
+    judged = []
 
-    def watched(self, dense, judged_views, *others):
-        judged.append(judged_views.views)
-        begin(self, dense, judged_views, *others)
+    def watched(*args):
+        judged.append(views_to_judge(*args))
+        return judged[-1]
 
-    monkeypatch.setattr(judging.Judge, "__init__", watched)
+    monkeypatch.setattr(measuring, "views_to_judge", watched)
     options = {"resolution": resolution, "target_mb": 0.01, "by": "opacity"}
     if search == "measure_tradeoff":
         ps.measure_tradeoff(room, tmp_path / "found", **{**options, "by": ("opacity",)}, repairs=("none",))
@@ -97,14 +98,14 @@ def test_scenes_are_judged_in_the_views_that_compact_compares_in(
         ps.save(ps.load(room), tmp_path / "rooms" / "room.ply")
         of = room if search == "compact" else tmp_path / "rooms"
         getattr(ps, search)(of, **options)
-    [views] = judged
+    [((views, _, _), _)] = judged
     assert (views.width, views.height) == (wanted.width, wanted.height)
     assert views.viewmats.equal(wanted.viewmats) and views.Ks.equal(wanted.Ks)
     assert max(views.width, views.height) == (405 if resolution is None else 96)
 
 
 def test_a_scene_that_needs_no_repair_is_given_as_it_was_pruned(dense, tmp_path):
-    found = find_scene(subject_of(dense, None), Targets(mb=0.01), "opacity", ("none",), lambda what, share: None)
+    found = find_scene(subject_of(dense, None), Targets(mb=0.01), "opacity", ("none",), SILENT)
     assert found.scene is found.pruned and not found.accepted and not found.repair_accepted
     assert found.psnr > 10 and len(found.views) == 3 and found.seconds > 0
     assert "side by side" in ps.plot_comparison(dense, found, tmp_path / "shown.png")
@@ -135,8 +136,7 @@ def test_it_is_said_in_which_views_a_target_holds_and_in_which_a_repair_is_accep
     photos = [ps.render(dense, view) for view in room_views]
     subject = replace(subject_of(dense, None), held_out=lambda count: (room_views, photos))
     repaired, pruned = (
-        find_scene(subject, Targets(mb=0.01), "opacity", (repairs,), lambda what, share: None).target
-        for repairs in ("quick", "none")
+        find_scene(subject, Targets(mb=0.01), "opacity", (repairs,), SILENT).target for repairs in ("quick", "none")
     )
     assert "dB against the dense scene's renders in 3 views of held-out photos, 48 pixels wide" in repaired
     assert repaired.endswith("; a repair is accepted in 3 views of 48 pixels of the photos that were trained on")
@@ -146,7 +146,7 @@ def test_it_is_said_in_which_views_a_target_holds_and_in_which_a_repair_is_accep
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"target_db": 30.0, "target_mb": 0.002}, "the smallest that reaches 30 dB .* where 0.002 are allowed"),
+        ({"target_db": 30.0, "target_mb": 0.002}, "the smallest that reaches 30 dB .* more than 2.00 kB"),
         ({"target_db": 90.0, "target_format": ".spz"}, "no scene reaches --target-db 90 in this format"),
         ({"target_mb": 1e-6}, "too small for one Gaussian"),
         ({"target_mb": 1e-6, "target_format": ".spz"}, "too small for one Gaussian"),
@@ -186,22 +186,23 @@ def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, d
     assert result.status == "failed" and "no scene meets all targets" in result.error
 
 
-def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room_views):
+def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(dense, room_views):
     photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))] * 3
-    small = JudgedViews(room_views, photos, "").resized(24)
-    assert (small.views.width, small.views.height) == (24, 18)
-    wanted = photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3))
-    assert torch.allclose(small.photos[0], wanted, atol=1e-6)
-    assert JudgedViews(room_views, photos, "").resized(48).photos is photos
+    subject = replace(subject_of(dense, None), held_out=lambda count: (room_views, photos))
+    (views, small, _), _ = views_to_judge(replace(subject, resolution=(24, 18)), 3)
+    assert (views.width, views.height) == (24, 18)
+    assert torch.allclose(small[0], photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3)), atol=1e-6)
+    assert views_to_judge(subject, 3)[0].photos is photos
 
 
-def test_lpips_is_given_where_weights_are_at_hand(dense, room_views, some_lpips):
-    judge = Judge(dense, JudgedViews(room_views, None, ""))
-    quality = judge.judge(ps.prune(dense, 100), lambda share: None).against_dense
-    assert (quality.lpips is not None and 0 < quality.lpips < 2) == some_lpips
-    assert ("LPIPS is missing" in judge.no_lpips) != some_lpips
+def test_lpips_is_given_where_weights_are_at_hand(dense, some_lpips):
+    measurer = Measurer(subject_of(dense, None), 3, SILENT, timed=False)
+    lpips = measurer.measure(Setting(100, 1, by="opacity"), SILENT).against_dense.lpips
+    assert (lpips is not None and 0 < lpips < 2) == some_lpips
+    assert any("LPIPS is missing" in note for note in measurer.notes) != some_lpips
 
 
 def test_pictures_too_small_for_ssim_are_refused(dense, room_views):
+    views = ViewSource(dense, given=replace(room_views, width=10))
     with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
-        Judge(dense, JudgedViews(replace(room_views, width=10), None, ""))
+        Measurer(Subject(dense, Path("room.ply"), "room", lambda: views), 3, SILENT)

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from making import assert_same_on_any_threads, camera_askew, splats_in_view
-from pointsplat_ns.rasterizer.compiled import projection
+from making import camera_askew, splats_in_view
+from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.projection import project
 
 WIDTH, HEIGHT = 37, 29
@@ -14,8 +14,7 @@ F32, F64 = torch.float32, torch.float64
 NAMES = ("means", "quats", "scales", "opacities", "viewmat")
 OUTPUTS = ("means2d", "depths", "cov2d", "det", "opacities", "directions")
 
-missing = projection.KERNELS.why_missing
-needs_compiler = pytest.mark.skipif(bool(missing), reason=missing)
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
 def scene_of(n=400, scale=-2.0, **options):
@@ -41,12 +40,9 @@ def _in_units_of(size):
     return change
 
 
-def _needles(aspect):
-    def change(means, quats, scales, *_):
-        scales[:, 0], scales[:, 1:] = 2.0, 2.0 / aspect
-        scales.copy_(scales.float())
-
-    return change
+def _needles(means, quats, scales, *_):
+    scales[:, 0], scales[:, 1:] = 2.0, 2e-6
+    scales.copy_(scales.float())
 
 
 def _meaningless(means, quats, scales, opacities, *_):
@@ -101,10 +97,7 @@ CASES = {
     "far from the origin": (_far_from_the_origin, {}),
     "units of 1e-9": (_in_units_of(1e-9), {"near_plane": 1e-11}),
     "units of 1e12": (_in_units_of(1e12), {"far_plane": math.inf}),
-    "needles of 1e4": (_needles(1e4), {}),
-    "needles of 1e6": (_needles(1e6), {}),
-    "flat": (lambda m, q, s, *_: s[:, 2].zero_(), {}),
-    "lines": (lambda m, q, s, *_: s[:, 1:].zero_(), {}),
+    "needles": (_needles, {}),
     "points": (lambda m, q, s, *_: s.zero_(), {}),
     "zero quaternions": (lambda m, q, *_: q[::2].zero_(), {}),
     "quaternions of any length": (_any_length, {}),
@@ -173,7 +166,7 @@ def at_a_bound(scene, options):
 
 @needs_compiler
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_seen_and_its_gradients_are_those_of_torch_and_as_near_to_float64(name):
+def test_projections_and_gradients_are_those_of_torch(name):
     scene, options = made(name)
     ours, torchs, exact = (projected(scene, options, *how) for how in ((F32, True), (F32, False), (F64, False)))
     ids, torchs_ids = (set(seen.ids.tolist()) for _, seen in (ours, torchs))
@@ -212,15 +205,3 @@ def test_where_no_gaussian_is_seen_gradients_are_zero(count):
     assert (seen.ids.dtype, seen.radii.dtype, seen.depth_keys.dtype) == (torch.int64, torch.int32, F32)
     grads = torch.autograd.grad(seen.means2d.sum() + seen.det.sum(), leaves)
     assert [g.shape for g in grads] == [leaf.shape for leaf in leaves] and not any(g.any() for g in grads)
-
-
-@needs_compiler
-def test_any_number_of_threads_projects_the_same_bits():
-    scene = scene_of(9000)
-
-    def results():
-        leaves, seen = projected(scene, {"antialiased": True}, F32, True)
-        values, grads = values_and_gradients(leaves, seen, seen.ids)
-        return [seen.ids, seen.depth_keys, seen.radii, *values, *grads]
-
-    assert_same_on_any_threads(results)

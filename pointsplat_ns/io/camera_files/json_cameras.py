@@ -1,12 +1,17 @@
-"""``transforms.json`` of nerfstudio, instant-ngp and NeRF-synthetic.
+"""Cameras in JSON: nerfstudio's ``transforms.json``, the poses of ``ns-export cameras``, and INRIA's ``cameras.json``.
 
-``frames`` have ``transform_matrix``, from camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``,
-``cx``, ``cy``, ``w``, ``h`` and the distortion stand in each frame or once for all; NeRF-synthetic has only
-``camera_angle_x``, the horizontal field of view in radians. ``applied_transform`` (3 x 4) and ``applied_scale`` say how
-the world of the original photos was moved before the file was saved.
+``transforms.json`` is that of nerfstudio, instant-ngp and NeRF-synthetic. ``frames`` have ``transform_matrix``, from
+camera to world, OpenGL axes (x right, y up, z back). ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` and the
+distortion stand in each frame or once for all; NeRF-synthetic has only ``camera_angle_x``, the horizontal field of view
+in radians. ``applied_transform`` (3 x 4) and ``applied_scale`` say how the world of the original photos was moved
+before the file was saved.
 
 ``ns-export cameras`` writes another file, ``transforms_train.json``: a list of ``file_path`` and ``transform`` (3 x 4,
 the same axes) without intrinsics. Its poses are those of the training, corrected ones too, in the scene's frame.
+
+INRIA's training of 3D Gaussian Splatting writes ``cameras.json`` beside its scenes: a list of cameras with ``id``,
+``img_name``, ``width``, ``height``, ``position`` (3), ``rotation`` (3 x 3, camera to world, OpenCV axes), ``fx`` and
+``fy``. The principal point is the picture's centre. Poses are in the scene's frame.
 """
 
 from __future__ import annotations
@@ -159,3 +164,31 @@ def _size_of_photos(frame: Any, path: Path) -> tuple[float, float]:
     width, height = (800, 800)  # of NeRF-synthetic, whose files do not say them
     logger.info("%s: no 'w' and 'h', and no photo to measure; taken for %d x %d pixels", path, width, height)
     return width, height
+
+
+def inria_cameras(content: list[Any], path: Path) -> CameraFile:
+    """The cameras in the JSON of a ``cameras.json``; a DataError if an entry is no camera."""
+    need_count(path, len(content))
+    return CameraFile([_inria_camera(entry, index, path) for index, entry in enumerate(content)])
+
+
+def _inria_camera(entry: Any, index: int, path: Path) -> Camera:
+    entry = entry if isinstance(entry, dict) else {}
+    rotation, position = matrix(entry.get("rotation"), (3,), 3), matrix([entry.get("position")], (1,), 3)
+    if rotation is None or position is None:
+        raise DataError(
+            f"{path}: camera {index} has no pose; expected 'rotation', 3 x 3 numbers, and 'position', 3 numbers, as "
+            "3DGS training writes them"
+        )
+    width, height, fx, fy = (finite(entry.get(name)) for name in ("width", "height", "fx", "fy"))
+    if width is None or height is None or fx is None or fy is None:
+        raise DataError(f"{path}: camera {index} has no intrinsics; expected numbers 'width', 'height', 'fx' and 'fy'")
+    rows = [[*row, place] for row, place in zip(rotation, position[0], strict=True)]
+    name = entry.get("img_name")
+    return Camera(
+        name if isinstance(name, str) else "",
+        [*sum(rows, []), 0.0, 0.0, 0.0, 1.0],
+        (width, height),
+        (fx, fy),
+        (0.5 * width, 0.5 * height),
+    )

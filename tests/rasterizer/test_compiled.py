@@ -1,0 +1,182 @@
+"""Compiled kernels find the tiles, make the colours and draw the images that torch does."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from making import assert_same_on_any_threads, record_kernels, splats_in_view
+from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer.compiled import KERNELS, blending
+from pointsplat_ns.rasterizer.ellipses import Region
+from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
+from pointsplat_ns.rasterizer.tiles import Footprints
+
+F32, F64 = torch.float32, torch.float64
+WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
+
+needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
+
+
+def draw(channels=3, n=3000, cameras=1, **options):
+    """Image, alphas, gradients and absolute gradients of random Gaussians of every opacity, some of them opaque; SH
+    coefficients in place of channels where ``sh_degree`` is given."""
+    *shape, sh = splats_in_view(n, seed=2, scale=-2.5, opacity=1.3, dtype=F64)
+    shape[3].clamp_(max=1.0)
+    colors = sh if "sh_degree" in options else torch.cat([sh[:, 0], sh[:, 1]], dim=1)[:, :channels]
+    K = torch.tensor([[50.0, 0, 33], [0, 52, 21], [0, 0, 1]]).repeat(cameras, 1, 1)
+    views = torch.eye(4).repeat(cameras, 1, 1)
+    views[:, 0, 3] = 0.3 * torch.arange(cameras)
+    leaves = [t.to(F32).requires_grad_() for t in (*shape, colors, views)]
+    image, alphas, meta = rasterization(*leaves, K, WIDTH, HEIGHT, absgrad=True, **options)
+    slope = torch.linspace(0.2, 1, WIDTH)[None, None, :, None]
+    ((image * slope).sin().sum() + (alphas * slope).square().sum()).backward()
+    return [image.detach(), alphas.detach(), *(t.grad for t in leaves), meta["means2d"].absgrad]
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"channels": channels} for channels in (1, 2, 3, 4)),
+        {"render_mode": "RGB+ED"},
+        {"cameras": 2},
+        {"quality": "fast"},
+        {"rasterize_mode": "antialiased"},
+        {"memory_budget": 100_000},
+        {"n": 3},
+    ],
+    ids=str,
+)
+def test_images_and_gradients_are_those_of_torch(options, monkeypatch):
+    kernel_calls = record_kernels(monkeypatch, blending)
+    got = draw(**options, compiled=True)
+    assert len(kernel_calls) >= 3
+    kernel_calls.clear()
+    wanted = draw(**options, compiled=False)
+    assert not kernel_calls
+    for ours, torchs in zip(got, wanted, strict=True):
+        # 2e-5: float32, in another order; a norm, as a pixel at a threshold may fall either way
+        assert torchs.any() and (ours - torchs).norm() <= 2e-5 * torchs.norm()
+
+
+@needs_compiler
+def test_any_number_of_threads_draws_the_same_bits():
+    assert_same_on_any_threads(
+        lambda: draw(n=9000, sh_degree=3, rasterize_mode="antialiased", memory_budget=400_000, compiled=True)
+    )
+
+
+# Colours
+
+
+def inputs(stored=17, n=500, m=300):
+    """Directions (M, 3) of any length, one of them zero, coefficients (N, K, 3), and rows in no order, float64 numbers
+    that float32 holds."""
+    g = torch.Generator().manual_seed(5)
+    directions = torch.randn(m, 3, generator=g) * 10.0 ** torch.linspace(-20, 20, m)[:, None]
+    directions[7] = 0
+    coefficients = torch.randn(n, stored, 3, generator=g)
+    return directions.double(), coefficients.double(), torch.randperm(n, generator=g)[:m]
+
+
+def colored(directions, coefficients, ids, degree, dtype, compiled, apart=False):
+    """Colours, and the gradients of a fixed sum of them, in float64; those of directions by unit of their length."""
+    leaves = [t.to(dtype, copy=True).requires_grad_() for t in (directions, coefficients)]
+    given = (leaves[1][:, 0], leaves[1][:, 1:]) if apart else leaves[1]
+    colors = sh_to_color(leaves[0], given, degree, ids, compiled)
+    weights = torch.randn(colors.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
+    grads = torch.autograd.grad((colors * weights).sum(), leaves, allow_unused=True)
+    of_directions = None if grads[0] is None else grads[0].double() * directions.norm(dim=1, keepdim=True)
+    return colors.detach().double(), of_directions, grads[1].double()
+
+
+@needs_compiler
+@pytest.mark.parametrize("extra", [0, 1])
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_gradients_are_those_of_torch_and_as_near_to_float64(degree, extra):
+    given = inputs(stored=(degree + 1) ** 2 + extra)
+    ours, torchs, exact = (colored(*given, degree, *how) for how in ((F32, True), (F32, False), (F64, False)))
+    assert (ours[0] == 0).any() and (ours[0] > 0).any()
+    assert (ours[1] is None) == (torchs[1] is None) == (degree == 0)  # a constant has no direction
+    for mine, theirs, right in zip(ours, torchs, exact, strict=True):
+        if mine is not None:
+            # a colour at 0 may fall on either side, and take its gradient with it: none does here
+            assert mine.isfinite().all() and (mine - right).abs().max() <= 2e-6 * right.abs().max()
+            assert (mine - right).norm() <= 2 * (theirs - right).norm() + 1e-7 * right.norm()
+    rest = torch.ones(len(given[1]), dtype=torch.bool).index_fill_(0, given[2], False)
+    assert not ours[2][rest].any() and not ours[2][:, (degree + 1) ** 2 :].any()
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("degree", range(4))
+def test_coefficients_apart_give_the_bits_of_those_together(degree, compiled):
+    given = inputs(stored=(degree + 1) ** 2 + 1)
+    for together, apart in zip(*(colored(*given, degree, F32, compiled, how) for how in (False, True)), strict=True):
+        assert (together is apart is None) if together is None else torch.equal(together, apart)
+
+
+@needs_compiler
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+def test_a_colour_that_is_not_finite_is_nan_and_no_other(wrong):
+    directions, coefficients, ids = inputs(stored=16)
+    coefficients[ids[3], 2, 1] = wrong
+    coefficients[ids[4], 9:] = wrong  # of a degree that is not evaluated
+    directions[5, 0] = wrong
+    got, wanted = (colored(directions, coefficients, ids, 2, F32, compiled)[0] for compiled in (True, False))
+    expected = torch.zeros_like(got, dtype=torch.bool)
+    expected[3, 1] = expected[5] = True
+    assert torch.equal(got.isnan(), expected) and torch.equal(wanted.isnan(), expected)
+    assert (got - wanted)[~expected].abs().max() <= 2e-6
+
+
+@needs_compiler
+def test_rows_of_no_gaussian_are_refused_before_memory_is_read():
+    directions, coefficients, ids = (t.float() if t.is_floating_point() else t for t in inputs())
+    assert sh_to_color(directions[:0], coefficients, 3, ids[:0]).shape == (0, 3)
+    for wrong in (-1, len(coefficients)):
+        with pytest.raises(IndexError, match=f"ids are from .*{wrong}.*expected rows of 500 Gaussians"):
+            sh_to_color(directions[:2], coefficients, 3, torch.tensor([3, wrong]))
+
+
+# Tiles
+
+
+def footprints(cameras, compiled, count=6000, size=(203, 149)):
+    """Of Gaussians in and around images, from points to needles and some larger than an image, some too faint to
+    draw."""
+    g = torch.Generator().manual_seed(1)
+    means2d = torch.rand(6000, 2, generator=g) * 400 - 100
+    xx, yy = (10.0 ** (4 * torch.rand(6000, 2, generator=g) - 1)).unbind(-1)
+    share = (2 * torch.rand(6000, generator=g) - 1) * 0.999
+    cov2d = torch.stack([xx, share * (xx * yy).sqrt(), yy], -1)
+    opacities, depths = torch.rand(6000, generator=g) ** 4, torch.randn(6000, generator=g).abs()
+    values = [means2d, cov2d, xx * yy * (1 - share * share), opacities, depths]
+    names = ("means2d", "cov2d", "det", "opacities", "depth_keys")
+    seen = SimpleNamespace(**{name: value[:count] for name, value in zip(names, values, strict=True)})
+    camera_ids = torch.randint(cameras, (6000,), generator=g)[:count]
+    return Footprints(seen, camera_ids, cameras, *size, compiled=compiled)
+
+
+REGIONS = (Region(0, 19, 0, 26), Region(3, 4, 0, 26), Region(5, 6, 7, 8), Region(18, 19, 25, 26))
+
+
+@needs_compiler
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_pairs_are_those_of_torch(cameras):
+    ours, torchs = (footprints(cameras, compiled) for compiled in (True, False))
+    assert ours.whole == torchs.whole == REGIONS[0]
+    assert ours.regions(5000) == torchs.regions(5000) and len(ours.regions(5000)) > 3
+    for region in REGIONS:
+        mine, theirs = ours.tiles(region), torchs.tiles(region)
+        assert len(theirs.gaussians) > 0
+        for name in ("gaussians", "offsets", "places", "counts", "order"):
+            assert torch.equal(getattr(mine, name), getattr(theirs, name)), (region, name)
+
+
+@needs_compiler
+def test_no_gaussian_gives_no_pair():
+    empty = footprints(2, True, count=0)
+    tiles = empty.tiles(empty.whole)
+    assert len(tiles.gaussians) == len(tiles.counts) == 0 and not tiles.offsets.any()
