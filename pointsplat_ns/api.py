@@ -166,7 +166,7 @@ def compact(
     clean: bool = False,
     effort: Effort = "quick",
     seconds: float | None = None,
-    photos: bool = False,
+    photos: bool | str | Path = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -223,10 +223,12 @@ def compact(
         >>> result.psnr > 15, result.seconds > 0
         (True, True)
     """
+    on_photos = photos is not False
     format_to_write(target_format)
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), photos, target_format)
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, photos)
-    _, result, _ = compact_source(scene, request, targets, Looking(views, resolution, up, data), progress)
+    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
+    looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
+    _, result, _ = compact_source(scene, request, targets, looking, progress)
     return result
 
 

@@ -23,6 +23,7 @@ from pointsplat_ns.views import Views
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
+    from pointsplat_ns.compression.posed_photos import PosedPhotos
     from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.search import Targets
@@ -46,6 +47,8 @@ class Looking:
     up: str | None = None
     data: str | Path | None = None
     """Where the data of a run is now, if it moved: the data itself, or a folder above it."""
+    photos: Path | None = None
+    """Folder of photos to train on; ``views`` then names the file with their poses, or is None."""
     size: tuple[int, int] | None = field(init=False)
     """``resolution``, parsed."""
     upward: Up | None = field(init=False)
@@ -103,12 +106,18 @@ def compact_source(
     """
     from pointsplat_ns.compression.quality import quality_if_seen
 
-    dense, source = read_source(scene, looking)
+    posed = None
+    if looking.photos is not None:
+        dense, source, posed = _read_with_photos(scene, looking, looking.photos, progress)
+    else:
+        dense, source = read_source(scene, looking)
     with progress_bar(progress) as report:
         if targets is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if request.photos is None else _training_photos(dense, scene, looking.data)
+            photos = None if posed is None else posed.training
+            if photos is None and request.photos is not None:
+                photos = _training_photos(dense, scene, looking.data)
             result = compact_scene(dense, request, source, report, photos)
         else:
             from pointsplat_ns.tradeoff.making import subject_of
@@ -122,6 +131,10 @@ def compact_source(
         if compared:
             quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), result.scene, compared)
     log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
+    if posed is not None and posed.held_out:
+        from pointsplat_ns.compression.posed_photos import held_out_text
+
+        log((held_out_text(dense.to(request.device), result, posed.held_out),))
     return dense, result, quality
 
 
@@ -162,11 +175,32 @@ def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]
     return dense, view_source(dense, given, looking.run_of(scene), data, looking.size, looking.upward)
 
 
+def _read_with_photos(
+    scene: Source, looking: Looking, folder: Path, progress: bool | Progress
+) -> tuple[Gaussians, ViewSource, PosedPhotos]:
+    """The dense scene, its views, and the photos in a folder. Raises SceneError if the options on views do not fit, and
+    as :func:`~pointsplat_ns.compression.posed_photos.read_posed_photos`."""
+    from pointsplat_ns.compression.posed_photos import read_posed_photos
+    from pointsplat_ns.io.scene import read_scene
+    from pointsplat_ns.looking.view_source import ViewSource
+
+    if isinstance(looking.views, Views) or without_poses(looking.views):
+        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
+    if looking.data is not None:
+        raise SceneError(f"{looking.data}: the data of a run, but photos are read from {folder}; expected one of both")
+    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
+    with progress_bar(progress) as report:
+        posed = read_posed_photos(dense, folder, looking.views, path, looking.size, report)
+    return dense, ViewSource(dense, posed.views, resolution=looking.size, up=looking.upward), posed
+
+
 def _training_photos(dense: Gaussians, scene: Source, data: str | Path | None) -> Photos:
     """The training photos of a run's dataset, which renders of the dense scene are like. Raises SceneError if there is
     no run, and DataError if its data is not found."""
     if isinstance(scene, Gaussians):
-        raise SceneError("photos are read from the dataset of a run; expected the path of a run")
+        raise SceneError(
+            "photos are read from the dataset of a run; expected the path of a run, or the folder of the photos"
+        )
     from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
 
     photos = training_photos(scene, data)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
@@ -25,6 +26,25 @@ if TYPE_CHECKING:
     from pointsplat_ns.gaussians import Gaussians
 
 
+def _photos(words: list[str]) -> Path | bool:
+    if len(words) > 1 or words == [""]:
+        raise ValueError("expected a folder of photos, or nothing for those of a run")
+    return Path(words[0]) if words else True
+
+
+Photos = Annotated[
+    Path | bool,
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[FOLDER]",
+        instance_from_str=_photos,
+        is_instance=lambda value: isinstance(value, (bool, Path)),
+        str_from_instance=lambda value: [str(value)] if isinstance(value, Path) else [] if value else ["none"],
+    ),
+]
+"""Whether to train on the photos of a run, or the folder of other photos."""
+
+
 def compact(
     scene: options.Scenes,
     output: options.Output = None,
@@ -35,7 +55,7 @@ def compact(
     clean: bool = False,
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
-    photos: bool = False,
+    photos: Photos = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: options.Megabytes | None = None,
@@ -79,8 +99,9 @@ def compact(
         effort: length of the repair: no steps (instant), 192 (quick), or 1200 (thorough).
         seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
             the scene so far.
-        photos: for a run: after the repair also train on the training photos of its dataset, by 1200 steps (quick)
-            or 12000 (thorough), or for --seconds. Photos in and outside of the steps say whether it helped.
+        photos: after the repair also train on photos, by 1200 steps (quick) or 12000 (thorough), or for --seconds.
+            Photos in and outside of the steps say whether it helped. For a run, those of its dataset; for any scene,
+            those in FOLDER, with the poses of --poses, or of a file of cameras there, above it or beside the scene.
         target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
             chooses count, SH degree and repair, in place of --keep and --sh. By default there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
@@ -124,12 +145,13 @@ def compact(
     check_limit(html_limit)
     kind = format_to_write(output)
     request = CompactRequest.of(
-        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), photos, kind.budget_suffix
+        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
     )
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, photos)
+    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
+    looking = Looking(poses, resolution, up, data, photos if isinstance(photos, Path) else None)
     with fixed_threads(threads):
         dense, result, quality = compact_source(
-            scene, request, targets, Looking(poses, resolution, up, data), progress=True, compared=kind.budget_suffix
+            scene, request, targets, looking, progress=True, compared=kind.budget_suffix
         )
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)

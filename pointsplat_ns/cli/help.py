@@ -14,6 +14,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "compact": (
         ("a tenth, repaired, and a page to compare", "pointsplat compact room.ply --keep 10% --html small.html"),
         ("the smallest file of at least 32 dB", "pointsplat compact room.ply --target-db 32 -o small.sog"),
+        ("with the photos and their COLMAP model", "pointsplat compact room.ply --photos images --poses sparse/0"),
         ("every scene of a folder, four at a time", "pointsplat compact rooms --keep 10% --jobs 4"),
     ),
     "lod": (

@@ -118,14 +118,14 @@ def photo_repair(
     unseen = list(range(0, len(photos), 8))[:6]
     used = sorted({*range(len(photos))} - {*unseen})
     compared = unseen + [used[place] for place in spread_indices(len(used), len(unseen))]
-    best, before = scene, _psnr(scene, photos, compared)
+    best, before = scene, mean_psnr(scene, photos, compared)
     after = before
 
     def compare(scene: Gaussians) -> None:
         nonlocal best, after, checked
         if int(8 * run.done) > checked:  # eight times
             checked = int(8 * run.done)
-            if (psnr := _psnr(scene, photos, compared)) > after:
+            if (psnr := mean_psnr(scene, photos, compared)) > after:
                 best, after = scene, psnr
 
     run.take(_scenes(scene, _examples(photos, used, dense, views), views, run), compare, progress)
@@ -154,8 +154,8 @@ def _scenes(
 
 
 @torch.no_grad()
-def _psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
-    """Mean PSNR in some photos, dB, in every k-th of their pixels."""
+def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
+    """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
     psnrs = []
     for index in indices:
         view, photo, mask = every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device)

@@ -51,8 +51,11 @@ def full_precision(function: Function) -> Function:
 
 
 def _copied(value: Any) -> Any:
-    """A dataclass whose tensors of inference mode are copied; anything else as it is."""
+    """A tensor of inference mode, copied; a dataclass with such tensors, copied; anything else as it is."""
+    if isinstance(value, torch.Tensor):
+        return value.clone() if value.is_inference() else value
     fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else ()
-    tensors = {field.name: getattr(value, field.name) for field in fields}
-    changes = {name: t.clone() for name, t in tensors.items() if isinstance(t, torch.Tensor) and t.is_inference()}
+    parts = {field.name: getattr(value, field.name) for field in fields if field.init}
+    copies = {name: _copied(part) for name, part in parts.items()}
+    changes = {name: copy for name, copy in copies.items() if copy is not parts[name]}
     return dataclasses.replace(value, **changes) if changes else value

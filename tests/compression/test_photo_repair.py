@@ -94,7 +94,7 @@ def test_photos_outside_of_the_steps_decide_with_as_many_others(hollow_ball, pru
         trained = photo_repair(pruned, hollow_ball, mixed, FewViews(hollow_ball), PhotoBudget("quick"))
     assert (trained.after > trained.before) == kept == (trained.scene is not pruned)
     if kept:
-        assert module._psnr(trained.scene, mixed, [0, 8, 16]) < module._psnr(pruned, mixed, [0, 8, 16]) - 0.2
+        assert module.mean_psnr(trained.scene, mixed, [0, 8, 16]) < module.mean_psnr(pruned, mixed, [0, 8, 16]) - 0.2
 
 
 def test_ctrl_c_gives_the_best_scene_so_far(hollow_ball, pruned, photos):
@@ -160,7 +160,7 @@ def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
     first, second = (gradients_of(pruned, *some[1]) for some in (wrong, right))
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert any(float(value.abs().max()) > 0 for value in first.values())
-    assert module._psnr(pruned, wrong, [0, 8]) == module._psnr(pruned, right, [0, 8])
+    assert module.mean_psnr(pruned, wrong, [0, 8]) == module.mean_psnr(pruned, right, [0, 8])
 
 
 def test_a_run_is_compacted_with_its_photos(trained_walls):

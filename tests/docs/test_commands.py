@@ -32,7 +32,7 @@ def files_of(words: tuple[str, ...]) -> list[str]:
 def runs_quickly(words: tuple[str, ...]) -> bool:
     """Whether a command makes the example room small with nothing else at hand and no optimisation."""
     ours = words[:1] == ("pointsplat",) and words[1] in ("prune", "compact") and words[2] == "room.ply"
-    takes_long = {"--seconds", "--target-db"} & {*words}
+    takes_long = {"--seconds", "--target-db", "--photos"} & {*words}
     return ours and not takes_long and not any(word.startswith("outputs/") for word in words)
 
 

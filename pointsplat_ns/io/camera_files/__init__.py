@@ -12,7 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, CameraFile, Motion, checked_views, photo_order, rigid
+from pointsplat_ns.io.camera_files.cameras import (
+    CAMERA_LIMITS,
+    Camera,
+    CameraFile,
+    Motion,
+    checked_views,
+    photo_order,
+    rigid,
+)
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
 from pointsplat_ns.io.camera_files.json_cameras import exported_cameras, inria_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
@@ -36,8 +44,17 @@ class NamedViews:
     folders: Sequence[Path]
     """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model in the folders
     ``images`` of the project."""
-    in_scene_frame: bool = False
-    """Whether the format of the file says that its poses are in the frame of a trained scene."""
+    cameras: Sequence[Camera]
+    """As the file has them, in the order of the views."""
+    saved: Motion | None
+    """The motion of the dataset's world before the file was saved, see :class:`~cameras.CameraFile`."""
+    motion: Motion | None
+    """What moved the poses of the file into the frame of the scene; None if nothing did."""
+
+    @property
+    def in_scene_frame(self) -> bool:
+        """Whether the format of the file says that its poses are in the frame of a trained scene."""
+        return self.saved is None
 
     def photo(self, index: int) -> Path | None:
         """The photo of a view; None if it does not lie in one of the folders or below."""
@@ -127,7 +144,9 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
         motion = found.saved.undone_before(Motion(exact, scale))
     names = [camera.name for camera in found.cameras]
     views = checked_views(path, found.cameras, motion)
-    return NamedViews(views, [names[index] for index in photo_order(names)], folders, found.saved is None)
+    order = photo_order(names)
+    cameras = [found.cameras[index] for index in order]
+    return NamedViews(views, [names[index] for index in order], folders, cameras, found.saved, motion)
 
 
 def _json_cameras(path: Path) -> CameraFile:

@@ -50,6 +50,12 @@ class Camera(NamedTuple):
     """fx and fy, pixels."""
     centre: tuple[float, float]
     """Principal point, pixels, the first pixel's centre at (0.5, 0.5)."""
+    model: str = "PINHOLE"
+    """COLMAP's name of the camera model."""
+    distortion: tuple[float, ...] = ()
+    """Its parameters after the principal point."""
+    mask: str = ""
+    """Name of the file of the pixels that count; empty if all do."""
 
 
 @dataclass(frozen=True)

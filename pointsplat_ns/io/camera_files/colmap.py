@@ -1,7 +1,7 @@
 """A COLMAP model: a folder with ``cameras.bin`` and ``images.bin``, or ``cameras.txt`` and ``images.txt``.
 
 Poses are from world to camera: a quaternion wxyz and a translation, OpenCV axes. Of a camera's parameters the focal
-lengths and the principal point are taken. Points are skipped and never held in memory.
+lengths, the principal point and the distortion are taken. Points of images are skipped and never held in memory.
 
 Source: the format as https://colmap.github.io/format.html and COLMAP's own list of camera models define it.
 """
@@ -11,10 +11,12 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import torch
+from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
@@ -42,8 +44,13 @@ class _Lens(NamedTuple):
     size: tuple[float, float]
     focal: tuple[float, float]
     centre: tuple[float, float]
-    bent: bool
-    """Whether it has distortion."""
+    model: str
+    distortion: tuple[float, ...]
+
+    @property
+    def bent(self) -> bool:
+        """Whether it has distortion."""
+        return "FISHEYE" in self.model or any(self.distortion)
 
 
 class _Image(NamedTuple):
@@ -52,6 +59,8 @@ class _Image(NamedTuple):
     """Quaternion wxyz and translation, world to camera."""
     camera: int
 
+
+_MOST_POINTS = 5_000_000
 
 _FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _BELOW = ("", "0", "sparse/0", "sparse", "colmap/sparse/0")
@@ -104,16 +113,52 @@ def colmap_cameras(path: Path) -> CameraFile:
     lengths = poses[:, :4].norm(dim=1)
     matrices[~((lengths > 1e-6) & (lengths < 1e6))] = torch.nan
     cameras = [
-        Camera(image.name, pose, *lenses[image.camera][:3])
+        Camera(image.name, pose, *lenses[image.camera])
         for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
     ]
     return CameraFile(cameras, Motion(torch.eye(4, **DOUBLES)[:3]))
 
 
+def colmap_points(path: Path) -> Tensor | None:
+    """Positions (N, 3), float64, of the points of a COLMAP model, ``path`` as for :func:`model_folder`; None if there
+    are none that can be read, or more than five million."""
+    folder = model_folder(path) or path
+    for kind, read in (("bin", _binary_points), ("txt", _text_points)):
+        file = folder / f"points3D.{kind}"
+        try:
+            if file.is_file():
+                with file.open("rb") as stream:
+                    points = torch.tensor([*islice(read(stream, file), _MOST_POINTS + 1)], **DOUBLES).view(-1, 3)
+                usable = 0 < len(points) <= _MOST_POINTS and bool(points.isfinite().all())
+                return points if usable else None
+        except (OSError, DataError, ValueError, IndexError):
+            return None
+    return None
+
+
+def _binary_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
+    """A count, and for each point its number, position, colour, error, and track, after its length."""
+    count = struct.unpack("<Q", _exactly(stream, 8, path))[0]
+    for _ in range(count):
+        _, x, y, z, *_, seen = struct.unpack("<Q3d3BdQ", _exactly(stream, 51, path))
+        _exactly(stream, 8 * min(seen, 1 << 20), path)
+        yield x, y, z
+
+
+def _text_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
+    """The lines "POINT3D_ID X Y Z R G B ERROR TRACK[]", which may be long."""
+    begins = True
+    while line := stream.readline(_LONGEST_LINE):
+        if begins and not line.startswith(b"#") and line.strip():
+            yield tuple(float(word) for word in line.split(maxsplit=4)[1:4])
+        begins = line.endswith(b"\n")
+
+
 def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
     _, focals, _ = COLMAP_CAMERAS[name]
-    bent = "FISHEYE" in name or any(params[focals + 2 :])
-    return _Lens(size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), bent)
+    return _Lens(
+        size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), name, params[focals + 2 :]
+    )
 
 
 def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:

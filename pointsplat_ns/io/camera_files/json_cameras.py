@@ -105,13 +105,19 @@ def _camera(frame: dict[str, Any], said: dict[str, Any], index: int, path: Path,
     pose = _pose(frame.get("transform_matrix"))
     if pose is None:
         raise DataError(f"{path}: camera {index} has no pose; expected 'transform_matrix', 4 x 4 numbers")
-    name = frame.get("file_path")
+    name, mask = (text if isinstance(text, str) else "" for text in (frame.get("file_path"), frame.get("mask_path")))
+    fisheye = kind in ("OPENCV_FISHEYE", "FISHEYE")
+    model = "OPENCV_FISHEYE" if fisheye else "FULL_OPENCV, with k4" if finite(said["k4"]) else "FULL_OPENCV"
+    order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return Camera(
-        name if isinstance(name, str) else "",
+        name,
         pose,
         (width, height),
         (fx, fy),
         (0.5 * width if cx is None else cx, 0.5 * height if cy is None else cy),
+        model,
+        tuple(finite(said[name]) or 0.0 for name in order),
+        mask,
     )
 
 
