@@ -90,15 +90,12 @@ PAGE = """# What each setting of merging is worth
 `lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
 rule off, or moves a setting to a value beside its default.
 
-- A change is PSNR of the variant minus PSNR of the defaults, dB: mean (smallest…largest) over scenes. Below 0, the
-  default is better.
-- Splats are judged in at most {views} views of a camera path that was written by hand, {width} pixels wide.
-- Captures are judged in the poses of at most {views} held-out photos, at the size of the photos: once merged without
-  poses, once with the poses of the training photos.
-- PSNR is that of [the judge](judge.md).
+- A change is [PSNR](judge.md) of the variant minus that of the defaults, dB: mean (smallest…largest) over scenes. Below
+  0, the default is better. `other_views` shows how much is chance.
+- Splats are judged in at most {views} views of a camera path, {width} pixels wide; captures in the poses of at most
+  {views} held-out photos, merged without poses and with those of the training photos.
 - CPU is CPU seconds of merging, relative to the defaults.
-- Variants come in the order of their mean changes. `other_views` shows how much is chance.
-- Fields of `merging/settings.py` say what they do.
+- `merging/settings.py` describes the settings.
 
 ## Scenes
 
