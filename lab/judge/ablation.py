@@ -90,8 +90,8 @@ PAGE = """# What each setting of merging is worth
 `lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
 rule off, or moves a setting to a value beside its default.
 
-- A change is [PSNR](judge.md) of the variant minus that of the defaults, dB: mean (smallest…largest) over scenes. Below
-  0, the default is better. `other_views` shows how much is chance.
+- A change is [PSNR](judge.md) of the variant minus that of the defaults, dB: mean (smallest…largest) over scenes and
+  poses with both. Below 0, the default is better. `other_views` shows how much is chance.
 - Splats are judged in at most {views} views of a camera path, {width} pixels wide; captures in the poses of at most
   {views} held-out photos, merged without poses and with those of the training photos.
 - CPU is CPU seconds of merging, relative to the defaults.
@@ -200,10 +200,8 @@ def variant_table(found: pd.DataFrame, settings: dict[str, Any]) -> tuple[str, l
             some = same.loc[same["keep"] == keep, "change"]
             cells.append(f"{some.mean():+.2f} ({some.min():+.2f}…{some.max():+.2f})" if len(some) else "-")
         ratio = same["cpu_seconds"].sum() / same["cpu_seconds_default"].sum()
-        lines.append(
-            [f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}", len(same[["scene", "at"]].drop_duplicates())]
-        )
-    return markdown(["variant", "change", *map(percent, keeps), "CPU", "scenes and poses"], lines), still
+        lines.append([f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}"])
+    return markdown(["variant", "change", *map(percent, keeps), "CPU"], lines), still
 
 
 def page(rows: list[Row], settings: dict[str, Any]) -> str:

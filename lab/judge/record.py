@@ -48,7 +48,7 @@ PAGE = """# What smaller scenes lose
 
 - Splats are judged in at most {views} views of a camera path, captures in the poses of at most {views} held-out photos
   and at their size. Every way gets the PLY alone: no photos and no poses.
-- PSNR is in dB, against renders of the dense scene, over the pixels that it covers.
+- PSNR is in dB, against renders of the dense scene: all squared error, divided by the share of pixels that it covers.
 - {peer} stands for the best of its modes in each cell: {modes}.
 - Figures are means over scenes, with the worst scene in brackets.
 """
@@ -162,7 +162,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         PAGE.format(
             views=settings["views"], peer=PEER, modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes)
         ),
-        "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
+        "## Scenes\n\n" + SCENES + "\n\n" + _scene_lines(rows, figures),
         *(section(figures, at) for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH),
     ]
     if table := _unlearned_table(rows, figures):
@@ -204,19 +204,18 @@ TIME = """CPU seconds and peak memory of one process, with starting, reading and
 splat-transform stands for the mode of the best PSNR."""
 
 
-def _scene_table(rows: list[Row], figures: Figures) -> str:
-    lines, missing, shown = [], [], figures.table.index.droplevel("way")
+def _scene_lines(rows: list[Row], figures: Figures) -> str:
+    """All scenes with their Gaussians, by what they are judged in and by list, and what was not measured."""
+    lists: dict[str, list[str]] = {}
+    missing, shown = [], figures.table.index.droplevel("way")
     for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
         there = set(shown[shown.get_level_values("scene") == scene].get_level_values("keep"))
         if gaps := [percent(keep) for keep in figures.keeps if keep not in there]:
             missing.append(f"{scene} at {', '.join(gaps)}")
-        where = "held-out photos" if at else "camera path"
-        lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other"])
-    heads, lists = ["scene", "Gaussians", "views", "list"], {line[-1] for line in lines}
-    if len(lists) == 1:
-        heads, lines = heads[:-1], [line[:-1] for line in lines]
-    table = markdown(heads, lines) + (f'\n\nAll are of the list "{lists.pop()}".' if len(lists) == 1 else "")
-    return table + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
+        where = f"Held-out photos, {group_of(scene) or 'other'}" if at else f"Camera path, {group_of(scene) or 'other'}"
+        lists.setdefault(where, []).append(f"{scene} ({same[0]['gaussians']:,})")
+    lines = "\n".join(f"- {where}: {', '.join(scenes)}." for where, scenes in lists.items())
+    return "Gaussians in brackets:\n\n" + lines + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
 
 
 def _by_budget(figures: Figures, head: str, columns: dict[str, dict[float, str]]) -> str:
