@@ -212,13 +212,13 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     for (scene, count, at), same in base.groupby(["scene", "gaussians", base["at"].astype(str)]):
         psnr = same.set_index("keep")["covered_psnr"]
         cells = [f"{psnr[keep]:.2f}" if keep in psnr else "-" for keep in keeps]
-        lines.append([scene, f"{count:,}", where.get(at, "camera path"), group_of(scene) or "other", *cells])
+        lines.append([f"{scene} ({group_of(scene) or 'other'})", f"{count:,}", where.get(at, "camera path"), *cells])
     variants, still = variant_table(table_of(rows), settings)
     now = json.loads(json.dumps(settings_of(0, 0)))
     moved = [n for n, value in now.items() if "." in n and settings.get(n, value) != value]
     return PAGE.format(
         **{name: settings[name] for name in ("views", "width")}, little=LITTLE, variants=variants,
-        scenes=markdown(["scene", "Gaussians", "views", "list", *map(percent, keeps)], lines),
+        scenes=markdown(["scene (list)", "Gaussians", "views", *map(percent, keeps)], lines),
         still=", ".join(f"`{name}`" for name in still) or "none",
         moved=f"\n\nDefaults that have changed since: {', '.join(f'`{name}`' for name in moved)}." if moved else "",
     )  # fmt: skip

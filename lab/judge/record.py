@@ -192,10 +192,10 @@ def section(figures: Figures, at: int | str) -> str:
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 """Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
 
-SCENES = f"""No constant is chosen on [scenes of the list "judged"](../benchmarks.md#scenes). Scenes of no list are "other".
-Three rules exist because a judged scene showed the need; their constants come from scenes for tuning: repairs hold from
-nearer places (rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show little blur
-(apt_kitchen_balcony). The network of `compact` was trained on {", ".join(LEARNED)}.
+SCENES = f"""No constant is chosen on [scenes of the list "judged"](../benchmarks.md#scenes). Scenes of no list are
+"other". Three rules exist because a judged scene showed the need; their constants come from scenes for tuning: repairs
+hold from nearer places (rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show
+little blur (apt_kitchen_balcony). The network of `compact` was trained on {", ".join(LEARNED)}.
 Rows of captures and of taebak are older: of other sampled views, and of repairs of 48 steps."""
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
@@ -271,7 +271,9 @@ def readme_table(rows: list[Row]) -> str:
     figures = Figures(rows)
     at = [at for at in figures.ats if at != PHOTOS][-1:] or figures.ats
     means = figures.of(at[0], "covered_psnr").groupby("keep").mean()
-    leads = [pd.concat([figures.lead(way, at, "covered_psnr") for at in figures.ats]).groupby("keep").min() for way in OURS]
+    leads = [
+        pd.concat([figures.lead(way, at, "covered_psnr") for at in figures.ats]).groupby("keep").min() for way in OURS
+    ]
     lines = [
         [percent(keep), *(f"{means.loc[keep, way]:.1f}" for way in WAYS), *(f"{lead[keep]:+.1f}" for lead in leads)]
         for keep in figures.keeps

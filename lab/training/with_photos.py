@@ -70,7 +70,7 @@ PAGE = f"""# With the photos at hand
 - `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" takes
   `--seconds` of the CPU seconds of the dense training: about half as many CPU seconds.
 - "{SCORES["lightgaussian"]}" keeps the Gaussians with the highest scores and trains them as `{COMPACTED}` does,
-  for as many CPU seconds, with reading and scores on top. The method's own schedule is longer.
+  for as many CPU seconds. The method's own schedule is longer.
 - "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num`. "{CAP_SHORT}" takes about the CPU seconds of
   `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - "-" was not measured.
