@@ -61,8 +61,8 @@ METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
 
 PAGE = f"""# With the photos at hand
 
-`lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants of
-`{COMPACTED}` and of the training with a cap are chosen on fox, kitchen and vr_project. The others judge.
+`lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants
+of `{COMPACTED}` and of the training with a cap are chosen on fox, kitchen and vr_project. The others judge.
 
 - PSNR and LPIPS are means over all held-out photos, at the size of the photos of the training.
 - "s" are CPU seconds of a process on one thread, with starting, reading and writing. All ways but the cap need the
