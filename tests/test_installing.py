@@ -180,13 +180,16 @@ def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstud
     assert made == ["example"]
 
 
-def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys):
+def test_what_the_package_itself_lacks_is_one_line_too(monkeypatch, capsys, tmp_path):
+    scene = tmp_path / "a.ply"
+    scene.touch()
+
     def fail(*_, **__):
         raise ModuleNotFoundError("No module named 'av'", name="av")
 
     monkeypatch.setattr("pointsplat_ns.info", fail)
     with pytest.raises(SystemExit) as end:
-        main(["info", "a.ply"])
+        main(["info", str(scene)])
     assert end.value.code == 1
     assert capsys.readouterr().err == "error: av is not installed; pip install pointsplat-ns adds what is missing\n"
 

@@ -90,15 +90,12 @@ PAGE = """# What each setting of merging is worth
 `lab/judge/ablation.py` writes this page from [ablation.json](ablation.json), which it measured. Each variant turns a
 rule off, or moves a setting to a value beside its default.
 
-- A change is PSNR of the variant minus PSNR of the defaults, dB: mean (smallest…largest) over scenes. Below 0, the
-  default is better.
-- Splats are judged in at most {views} views of a camera path that was written by hand, {width} pixels wide.
-- Captures are judged in the poses of at most {views} held-out photos, at the size of the photos: once merged without
-  poses, once with the poses of the training photos.
-- PSNR is that of [the judge](judge.md).
+- A change is [PSNR](judge.md) of the variant minus that of the defaults, dB: mean (smallest…largest) over scenes and
+  poses with both. Below 0, the default is better. `other_views` shows how much is chance.
+- Splats are judged in at most {views} views of a camera path, {width} pixels wide; captures in the poses of at most
+  {views} held-out photos, merged without poses and with those of the training photos.
 - CPU is CPU seconds of merging, relative to the defaults.
-- Variants come in the order of their mean changes. `other_views` shows how much is chance.
-- Fields of `merging/settings.py` say what they do.
+- `merging/settings.py` describes the settings.
 
 ## Scenes
 
@@ -203,10 +200,8 @@ def variant_table(found: pd.DataFrame, settings: dict[str, Any]) -> tuple[str, l
             some = same.loc[same["keep"] == keep, "change"]
             cells.append(f"{some.mean():+.2f} ({some.min():+.2f}…{some.max():+.2f})" if len(some) else "-")
         ratio = same["cpu_seconds"].sum() / same["cpu_seconds_default"].sum()
-        lines.append(
-            [f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}", len(same[["scene", "at"]].drop_duplicates())]
-        )
-    return markdown(["variant", "change", *map(percent, keeps), "CPU", "scenes and poses"], lines), still
+        lines.append([f"`{name}`", "; ".join(moves), *cells, f"{ratio:.2f}"])
+    return markdown(["variant", "change", *map(percent, keeps), "CPU"], lines), still
 
 
 def page(rows: list[Row], settings: dict[str, Any]) -> str:
@@ -217,13 +212,13 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
     for (scene, count, at), same in base.groupby(["scene", "gaussians", base["at"].astype(str)]):
         psnr = same.set_index("keep")["covered_psnr"]
         cells = [f"{psnr[keep]:.2f}" if keep in psnr else "-" for keep in keeps]
-        lines.append([scene, f"{count:,}", where.get(at, "camera path"), group_of(scene) or "other", *cells])
+        lines.append([f"{scene} ({group_of(scene) or 'other'})", f"{count:,}", where.get(at, "camera path"), *cells])
     variants, still = variant_table(table_of(rows), settings)
     now = json.loads(json.dumps(settings_of(0, 0)))
     moved = [n for n, value in now.items() if "." in n and settings.get(n, value) != value]
     return PAGE.format(
         **{name: settings[name] for name in ("views", "width")}, little=LITTLE, variants=variants,
-        scenes=markdown(["scene", "Gaussians", "views", "list", *map(percent, keeps)], lines),
+        scenes=markdown(["scene (list)", "Gaussians", "views", *map(percent, keeps)], lines),
         still=", ".join(f"`{name}`" for name in still) or "none",
         moved=f"\n\nDefaults that have changed since: {', '.join(f'`{name}`' for name in moved)}." if moved else "",
     )  # fmt: skip

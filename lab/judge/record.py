@@ -27,9 +27,6 @@ from pointsplat_ns.io.files import replacing
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "record"
 
-AHEAD = {"covered_psnr": "against the dense scene's renders", "photo_psnr": "against held-out photos"}
-"""What leads are taken of, and its name."""
-
 OURS = ("prune", "compact")
 """Our ways, as rows call them."""
 
@@ -47,15 +44,12 @@ START, END = "<!-- judge -->", "<!-- /judge -->"
 PAGE = """# What smaller scenes lose
 
 `lab/judge/record.py` writes this page from [judge.json](judge.json) and [judge_photos.json](judge_photos.json), which
-`lab/judge/judge.py` measured. [benchmarks.md](../benchmarks.md#a-judge-that-is-not-the-defendant) says how.
+`lab/judge/judge.py` measured. [benchmarks.md](../benchmarks.md#the-judge) explains how.
 
-- Splats are judged in at most {views} views of a camera path that was written by hand, at several widths.
-- Captures are judged in the poses of at most {views} held-out photos, at the size of the photos.
-- Every way gets the PLY alone: no photos and no poses.
-- PSNR is in dB, against renders of the dense scene. All squared error is divided by the share of the pixels that the
-  dense scene covers, so an empty background does not raise it.
-- {peer} stands for the best of its modes: {modes}.
-  The mode is chosen anew for each scene, budget, width and measure.
+- Splats are judged in at most {views} views of a camera path, captures in the poses of at most {views} held-out photos
+  and at their size. Every way gets the PLY alone: no photos and no poses.
+- PSNR is in dB, against renders of the dense scene: all squared error, divided by the share of pixels that it covers.
+- {peer} stands for the best of its modes in each cell: {modes}.
 - Figures are means over scenes, with the worst scene in brackets.
 """
 
@@ -168,7 +162,7 @@ def page(rows: list[Row], settings: dict[str, Any]) -> str:
         PAGE.format(
             views=settings["views"], peer=PEER, modes=", ".join(mode.removeprefix(PEER).strip() for mode in modes)
         ),
-        "## Scenes\n\n" + SCENES + "\n\n" + _scene_table(rows, figures),
+        "## Scenes\n\n" + SCENES + "\n\n" + _scene_lines(rows, figures),
         *(section(figures, at) for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH),
     ]
     if table := _unlearned_table(rows, figures):
@@ -186,11 +180,10 @@ def section(figures: Figures, at: int | str) -> str:
     parts = [f"## {title}", f"{_count(figures.scenes(at))}."]
     if at in (PHOTOS, *[other for other in figures.ats if other != PHOTOS][-1:]):
         parts.append("PSNR against renders of the dense scene:\n\n" + _mean_table(figures, at, "covered_psnr", 2))
+        if table := _lead_table(figures, at, "covered_psnr"):
+            parts.append(f"Leads in dB against these renders:\n\n{table}")
     if at == PHOTOS:
         parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
-    for column, where in AHEAD.items():
-        if table := _lead_table(figures, at, column):
-            parts.append(f"Leads in dB {where}:\n\n{table}")
     if at == LPIPS_WIDTH and (table := _mean_table(figures, at, "dense_lpips", 3)):
         parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
     return "\n\n".join(parts)
@@ -199,13 +192,11 @@ def section(figures: Figures, at: int | str) -> str:
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 """Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
 
-SCENES = f"""No constant is chosen on scenes of the list "judged". Scenes of no list are "other". Three rules exist
-because a judged scene had shown the need; their constants come from scenes for tuning: repairs hold from nearer places
-(rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show little blur
-(apt_kitchen_balcony). [benchmarks.md](../benchmarks.md#scenes) says where the scenes come from.
-The network that sets the steps of `compact` was trained on {", ".join(LEARNED)}.
-Rows of captures and of taebak are older than those of other splats: of other sampled views, and of repairs of 48
-steps."""
+SCENES = f"""No constant is chosen on [scenes of the list "judged"](../benchmarks.md#scenes). Scenes of no list are
+"other". Three rules exist because a judged scene showed the need; their constants come from scenes for tuning: repairs
+hold from nearer places (rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show
+little blur (apt_kitchen_balcony). The network of `compact` was trained on {", ".join(LEARNED)}.
+Rows of captures and of taebak are older: of other sampled views, and of repairs of 48 steps."""
 
 UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
 
@@ -213,19 +204,18 @@ TIME = """CPU seconds and peak memory of one process, with starting, reading and
 splat-transform stands for the mode of the best PSNR."""
 
 
-def _scene_table(rows: list[Row], figures: Figures) -> str:
-    lines, missing, shown = [], [], figures.table.index.droplevel("way")
+def _scene_lines(rows: list[Row], figures: Figures) -> str:
+    """All scenes with their Gaussians, by what they are judged in and by list, and what was not measured."""
+    lists: dict[str, list[str]] = {}
+    missing, shown = [], figures.table.index.droplevel("way")
     for (at, scene), same in sorted(grouped(rows, lambda row: (row["at"] == PHOTOS, row["scene"])).items()):
         there = set(shown[shown.get_level_values("scene") == scene].get_level_values("keep"))
         if gaps := [percent(keep) for keep in figures.keeps if keep not in there]:
             missing.append(f"{scene} at {', '.join(gaps)}")
-        where = "held-out photos" if at else "camera path"
-        lines.append([scene, f"{same[0]['gaussians']:,}", where, group_of(scene) or "other"])
-    heads, lists = ["scene", "Gaussians", "views", "list"], {line[-1] for line in lines}
-    if len(lists) == 1:
-        heads, lines = heads[:-1], [line[:-1] for line in lines]
-    table = markdown(heads, lines) + (f'\n\nAll are of the list "{lists.pop()}".' if len(lists) == 1 else "")
-    return table + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
+        where = f"Held-out photos, {group_of(scene) or 'other'}" if at else f"Camera path, {group_of(scene) or 'other'}"
+        lists.setdefault(where, []).append(f"{scene} ({same[0]['gaussians']:,})")
+    lines = "\n".join(f"- {where}: {', '.join(scenes)}." for where, scenes in lists.items())
+    return "Gaussians in brackets:\n\n" + lines + (f"\n\nNot measured: {'; '.join(missing)}." if missing else "")
 
 
 def _by_budget(figures: Figures, head: str, columns: dict[str, dict[float, str]]) -> str:
@@ -277,24 +267,19 @@ def _cost_table(figures: Figures) -> str:
 
 
 def readme_table(rows: list[Row]) -> str:
-    """The table of the README: means of all three ways, and smallest leads. Small pictures are left to the record."""
+    """The table of the README: means of all ways in the largest pictures, and the smallest leads over all pictures."""
     figures = Figures(rows)
-    lines = []
-    for at in (at for at in figures.ats if at == PHOTOS or at >= LPIPS_WIDTH):
-        means = figures.of(at, "covered_psnr").groupby("keep").mean()
-        name = "poses of held-out photos" if at == PHOTOS else f"{at} pixels wide"
-        cells = [
-            " / ".join(f"{means.loc[keep, way]:.1f}" for way in WAYS) if keep in means.index else "-"
-            for keep in figures.keeps
-        ]
-        lines.append([f"{name} ({_count(figures.scenes(at))})", *cells])
-    for method, what in (("prune", "smallest lead of `prune`"), ("compact", "smallest gain by `compact`")):
-        leads = pd.concat({at: figures.lead(method, at, "covered_psnr") for at in figures.ats}, names=["at"])
-        worst = {keep: (same.min(), same.idxmin()) for keep, same in leads.groupby("keep")}
-        lines.append(
-            [what, *(f"{worst[keep][0]:+.1f} ({worst[keep][1][2]}, {worst[keep][1][0]})" for keep in figures.keeps)]
-        )
-    return markdown(["kept", *map(percent, figures.keeps)], lines)
+    at = [at for at in figures.ats if at != PHOTOS][-1:] or figures.ats
+    means = figures.of(at[0], "covered_psnr").groupby("keep").mean()
+    leads = [
+        pd.concat([figures.lead(way, at, "covered_psnr") for at in figures.ats]).groupby("keep").min() for way in OURS
+    ]
+    lines = [
+        [percent(keep), *(f"{means.loc[keep, way]:.1f}" for way in WAYS), *(f"{lead[keep]:+.1f}" for lead in leads)]
+        for keep in figures.keeps
+        if keep in means.index
+    ]
+    return markdown(["kept", *map(_way, WAYS), "smallest lead of `prune`", "of `compact` over it"], lines)
 
 
 def put_between(text: str, new: str, path: Path) -> str:

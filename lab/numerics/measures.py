@@ -192,7 +192,7 @@ def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
     centre, size = content_size(truth)  # of equal Gaussians it is a matter of ties, and only a unit
     everyone, equal = torch.arange(len(truth)), torch.ones(len(truth))
     states = [
-        initial_state(Participants(part, everyone, centre, size), equal, MERGING, dtype=dtype)
+        initial_state(Participants(part, everyone, centre, size), equal, dtype=dtype)
         for part, dtype in ((scene, torch.float32), (truth, torch.float64))
     ]
     near = other_neighbours(states[1].means, MERGING.neighbours)

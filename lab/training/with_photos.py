@@ -61,27 +61,23 @@ METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
 
 PAGE = f"""# With the photos at hand
 
-`lab/training/with_photos.py` measures who has the photos, and wants few Gaussians, and writes this page from
-[with_photos.json](with_photos.json). Constants of `compact --photos` and of the training with a
-cap are chosen on fox, kitchen and vr_project. The others judge.
+`lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants
+of `{COMPACTED}` and of the training with a cap are chosen on fox, kitchen and vr_project. The others judge.
 
-- PSNR, SSIM and LPIPS are means over all held-out photos, at the size of the photos that the dense scene is trained on.
-- CPU s are CPU seconds of a process on one thread, with starting, reading and writing. "With dense" adds those of the
-  dense training, which all ways need but the training with a cap.
-- `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" trains on
-  them for as many seconds (`--seconds`) of the clock as the dense training took of the processor: about half
-  as many CPU seconds.
-- "{SCORES["lightgaussian"]}" and "{SCORES["pup"]}" keep the Gaussians with the highest scores and train
-  them on the photos as `{COMPACTED}` does, with its splits and merges, for as many CPU seconds as
-  `{COMPACTED}` takes in all; reading and scores come on top. The methods' own schedules are longer.
-- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num` from the start. "{CAP_SHORT}" takes about the CPU
-  seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
-- A way without a row was not measured there.
-- The machine was busy: CPU seconds of equal work differ by up to a half.
-- OpenSplat is not measured: at commit 15b7e80 it has no limit of Gaussians.
+- PSNR and LPIPS are means over all held-out photos, at the size of the photos of the training.
+- "s" are CPU seconds of a process on one thread, with starting, reading and writing. All ways but the cap need the
+  dense training as well. The machine was busy: equal work differs by up to a half.
+- `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" takes
+  `--seconds` of the CPU seconds of the dense training: about half as many CPU seconds.
+- "{SCORES["lightgaussian"]}" keeps the Gaussians with the highest scores and trains them as `{COMPACTED}` does,
+  for as many CPU seconds. The method's own schedule is longer.
+- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num`. "{CAP_SHORT}" takes about the CPU seconds of
+  `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
+- "-" was not measured.
 """
 
-HEADS = ("kept", "way", "Gaussians", "CPU s", "with dense", "PSNR", "SSIM", "LPIPS")
+COLUMNS = {"cpu_seconds": ("s", ",.0f"), "psnr": ("PSNR", ".2f"), "lpips": ("LPIPS", ".3f")}
+"""Figures of a way at one budget, with their heads and formats."""
 
 
 _POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import program; program()")
@@ -196,25 +192,27 @@ def page(rows: list[Row]) -> str:
     if leads:
         parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest to largest):\n\n{leads}")
     for scene, same in sorted(grouped(rows, lambda row: row["scene"]).items()):
-        first = same[0]
-        size = f"{first['width']} x {first['height']}"
-        parts.append(
-            f"## {scene}\n\nDense: {first['steps']:,} steps. {first['photos']} held-out photos of {size}.\n\n"
-            + scene_table(same)
-        )
+        dense = next(row for row in same if row["method"] == DENSE)
+        figures = ", ".join(f"{head} {cell}" for (head, _), cell in zip(COLUMNS.values(), _cells(dense), strict=True))
+        about = f"{dense['count']:,} Gaussians, {dense['steps']:,} steps, {figures}"
+        photos = f"{dense['photos']} held-out photos of {dense['width']} x {dense['height']}"
+        parts.append(f"## {scene}\n\nDense: {about}. {photos}.\n\n{scene_table(same)}")
     return "\n\n".join(parts) + "\n"
 
 
 def scene_table(rows: list[Row]) -> str:
-    """All ways for one capture, by budget."""
-    dense = next(row for row in rows if row["method"] == DENSE)
-    lines = []
-    for row in sorted(rows, key=lambda row: (-row["keep"], METHODS.index(row["method"]))):
-        with_dense = row["cpu_seconds"] + (dense["cpu_seconds"] if row["needs_dense"] else 0.0)
-        cells = [percent(row["keep"]), row["method"], f"{row['count']:,}"]
-        cells += [f"{row['cpu_seconds']:,.0f}", f"{with_dense:,.0f}", f"{row['psnr']:.2f}", f"{row['ssim']:.3f}"]
-        lines.append([*cells, f"{row['lpips']:.3f}" if "lpips" in row else "-"])
-    return markdown(HEADS, lines)
+    """All ways for one capture, budgets side by side."""
+    found = {(row["method"], row["keep"]): row for row in rows if row["method"] != DENSE}
+    keeps = sorted({keep for _, keep in found}, reverse=True)
+    ways = sorted({method for method, _ in found}, key=METHODS.index)
+    heads = [f"{percent(keep)}: {head}" for keep in keeps for head, _ in COLUMNS.values()]
+    lines = [[way, *(cell for keep in keeps for cell in _cells(found.get((way, keep), {})))] for way in ways]
+    return markdown(["way", *heads], lines)
+
+
+def _cells(row: Row) -> list[str]:
+    """The figures of a row in the order of :data:`COLUMNS`, "-" for those that it lacks."""
+    return [format(row[name], form) if name in row else "-" for name, (_, form) in COLUMNS.items()]
 
 
 def lead_table(rows: list[Row]) -> str:

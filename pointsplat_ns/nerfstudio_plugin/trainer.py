@@ -31,6 +31,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.memory import keep_freed_memory
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import fixed_threads, suitable_threads
 
 STATE = "pointsplat"
@@ -219,7 +220,7 @@ class StoppableTrainer(Trainer):
         if self.config.log_gradients:
             norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
             metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
-            metrics["Gradients/Total"] = sum(norms.values(), torch.zeros(()))
+            metrics["Gradients/Total"] = sum(norms.values(), torch.zeros((), **FLOATS))
         self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
         if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
             self.save_checkpoint(step)

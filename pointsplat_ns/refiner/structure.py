@@ -76,19 +76,19 @@ def curve_codes(coords: Tensor, bits: int, curves: Sequence[str]) -> list[Tensor
     """
     codes = []
     for curve in curves:
-        axes = coords[:, [1, 0, 2]] if curve.endswith("-trans") else coords
-        x, y, z = _gray_axes(axes, bits) if curve.startswith("hilbert") else axes.unbind(1)
-        codes.append(interleave(*map(spread_bits, (x, y, z))))
+        x, y, z = coords.unbind(1)
+        axes = (y, x, z) if curve.endswith("-trans") else (x, y, z)
+        codes.append(interleave(*map(spread_bits, _gray_axes(axes, bits) if curve.startswith("hilbert") else axes)))
     return codes
 
 
-def _gray_axes(coords: Tensor, bits: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Three numbers (N,) each, whose interleaved bits are the Hilbert codes of coordinates (N, 3).
+def _gray_axes(coords: tuple[Tensor, Tensor, Tensor], bits: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Three numbers (N,) each, whose interleaved bits are the Hilbert codes of coordinates (N,) each.
 
     At each bit, a mirror or an exchange of axes applies to all lower bits. Then the bits are Gray-coded. Source: J.
     Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707 (2004).
     """
-    axes = list(coords.unbind(1))
+    axes = list(coords)
     for bit in range(bits - 1, 0, -1):
         low = (1 << bit) - 1
         for i in range(3):

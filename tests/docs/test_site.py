@@ -65,7 +65,9 @@ def test_pictures_are_small():
 
 PAGE = "troubleshooting.md"
 
-MESSAGES = [block.text for block in BLOCKS if block.page.name == PAGE and block.language == "text"]
+MESSAGES = [
+    line for block in BLOCKS if block.page.name == PAGE and block.language == "text" for line in block.text.splitlines()
+]
 
 
 def room() -> ps.Gaussians:

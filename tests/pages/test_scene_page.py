@@ -104,7 +104,7 @@ def test_a_scene_that_alone_is_too_large_is_refused_and_nothing_is_written(rooms
         ([ball(9)], {"limit_mb": math.nan}, ps.PointSplatError, "a page of at most nan MB"),
         ([ball(9).map(lambda v: v * math.nan)], {}, ps.SceneError, "none of the 9 Gaussians can be drawn"),
         ([ball(9).replace(opacities=torch.full((9, 1), -math.inf))], {}, ps.DataError, "nothing .* can be seen"),
-        ([ball(9), ball(9)[:0]], {}, ps.SceneError, "none of the 0 Gaussians can be drawn"),
+        ([ball(9), ball(9)[:0]], {}, ps.SceneError, "holds no Gaussians that can be drawn"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_shown_is_refused_in_one_line(scenes, options, error, words, tmp_path):

@@ -93,6 +93,7 @@ def inline_code() -> Iterator[tuple[Path, str]]:
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 EVERY = [
     *(command for block in BLOCKS if block.language == "bash" for command in commands_of(block)),
+    *(Command(page.name, (*shlex.split(code),)) for page, code in inline_code() if page == PAGES[0] and " " in code),
     *(Command(f"pointsplat {name} --help", (*shlex.split(text),)) for name in EXAMPLES for _, text in EXAMPLES[name]),
 ]
 COMMANDS = [*{command.words: command for command in reversed(EVERY)}.values()]
