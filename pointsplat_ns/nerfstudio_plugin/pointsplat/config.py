@@ -67,7 +67,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     drop_at: float = 0.6
     """Share of the steps or of the time after which the schedule step has a tenth of the rates (the paper: 0.6)."""
     global_norm: float | None = None
-    """Largest norm of all gradients together; each optimiser's max-norm is that of the gradients of its own part."""
+    """Largest norm of all gradients together, in place of each optimiser's max-norm for its own part."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
     gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         self.timestamp = gathered([self.timestamp])[0]
 
     def setup(self, **kwargs) -> Trainer:
-        """Build the trainer with a copy of this config whose rates are set.
+        """Build the trainer with a copy of this config whose rates and limits of gradients are set.
 
         A resumed run ends ``max_num_iterations`` after the step that it resumes from, or when ``seconds`` are over, and
         so do its schedules: a run stopped at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had
@@ -112,11 +112,13 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
-        registered = RATES.get(self.method_name.removeprefix(f"{METHOD_NAMES.refiner}-"), REFINER_RATES)
+        registered = RATES.get((self.method_name or "").removeprefix(f"{METHOD_NAMES.refiner}-"), REFINER_RATES)
         for name, group in config.optimizers.items():
             if group["optimizer"].lr == registered.get(name):
                 group["optimizer"].lr = RATES[self.rates][name]
             group["optimizer"].lr *= self.rate_factor
+            if self.global_norm is not None:
+                group["optimizer"].max_norm = None
         _, together = torchrun_rank()
         if together > 1:  # nerfstudio, which did not start them, takes each for one alone
             kwargs |= {"local_rank": local_rank(), "world_size": together}
