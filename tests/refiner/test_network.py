@@ -66,6 +66,12 @@ def test_raw_features_are_the_numbers_of_the_scene_in_a_unit_cube():
     usual = gaussian_features(scene, cube, num_rest=15, dtype=torch.float32)
     assert torch.allclose(features.scales, 2 * usual.scales - 5, atol=1e-5)
     assert torch.equal(features.positions, usual.positions) and torch.equal(features.quats, usual.quats)
+    for raw, expected in ((True, features), (False, usual)):
+        seen = []
+        refiner = Refiner(preset("tiny", raw_inputs=raw)).eval()
+        refiner.encoder.register_forward_pre_hook(lambda _, arguments, seen=seen: seen.append(arguments[0]))
+        refiner(scene)
+        assert torch.equal(seen[0].opacities.sort(dim=0).values, expected.opacities.sort(dim=0).values)
 
 
 def seeded(seed: int = 0) -> torch.Generator:

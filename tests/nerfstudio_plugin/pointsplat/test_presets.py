@@ -17,7 +17,6 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
-from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import rate_factor_at
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.network import BatchNorm, SubmanifoldConv
 from pointsplat_ns.refiner.weights import read_metadata
@@ -77,9 +76,6 @@ def test_each_field_of_a_preset_is_that_of_its_source(name, column):
     optimizers = {part: group["optimizer"] for part, group in trainer.config.optimizers.items()}
     assert {part: optimizer.lr for part, optimizer in optimizers.items()} == {p: v[column] for p, v in BY_PART.items()}
     assert {(o.eps, o.max_norm, o.weight_decay) for o in optimizers.values()} == {((1e-8, 1e-15)[column], None, 0)}
-    drop = (6000, 7000)[column]
-    factors = [rate_factor_at(step / 10_000, config.schedule, config.drop_at) for step in (0, drop - 1, drop, 9999)]
-    assert factors == [1.0, 1.0, 0.1, 0.1]
 
 
 @pytest.mark.parametrize(("name", "depths"), [("paper", [2, 2, 2, 4, 2]), ("authors", [2, 2, 2, 6, 2])])
@@ -124,6 +120,12 @@ def test_a_preset_trains_and_its_run_and_weights_open_again(trained_walls, run_t
     assert "vgg" in trainer.pipeline.model.no_lpips_reason.lower(), "it says that LPIPS is left out"
     moved = {key.split(".")[0] for key, value in refiner.named_parameters() if not torch.equal(value, started[0][key])}
     assert moved == ({"encoder"} if name == "paper" else set()) | {"backbone", "heads"}
+    untrained = [key for key, value in refiner.named_parameters() if value.grad is None]
+    assert all(key.startswith("encoder.") for key in untrained) and bool(untrained) == (name == "authors")
+    assert set(BY_PART) - set(trainer.optimizers.optimizers) == (set() if name == "paper" else {"encoder"})
+    trainer.config.max_num_iterations, drop = 10_000, {"paper": 6000, "authors": 7000}[name]
+    factor = trainer.optimizers.schedulers["means"].lr_lambdas[0]
+    assert [factor(step) for step in (0, drop - 1, drop, 9999)] == [1.0, 1.0, 0.1, 0.1]
     assert config.get_base_dir().parts[-2] == f"pointsplat-{name}"
     with mock.patch.dict(all_methods, {config.method_name: PRESETS[name]()}):
         again = eval_setup(config.get_base_dir() / "config.yml")[1]
