@@ -32,3 +32,27 @@ def _pointsplat() -> MethodSpecification:
 
 
 pointsplat = load_specification("pointsplat", _pointsplat)
+
+
+def _pointsplat_paper() -> MethodSpecification:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import paper_config
+
+    return MethodSpecification(
+        config=paper_config(),
+        description="pointsplat with the settings of the PointSplat paper; needs a GPU.",
+    )
+
+
+pointsplat_paper = load_specification("pointsplat-paper", _pointsplat_paper)
+
+
+def _pointsplat_authors() -> MethodSpecification:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config
+
+    return MethodSpecification(
+        config=authors_config(),
+        description="pointsplat with the settings of the code that the paper's authors released; needs a GPU.",
+    )
+
+
+pointsplat_authors = load_specification("pointsplat-authors", _pointsplat_authors)

@@ -24,7 +24,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.outputs import claimed_folder
-from pointsplat_ns.io.runs import METHOD_NAMES, may_be_run, open_run
+from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.folder import check_folder, check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
@@ -345,6 +345,6 @@ def plot_views(
 
 def _is_refiner_run(path: str | Path) -> bool:
     try:
-        return may_be_run(path) and open_run(path, need_data=False).method_name == METHOD_NAMES.refiner
+        return may_be_run(path) and open_run(path, need_data=False).is_refiner
     except SceneError:
         return False  # a single scene, or not readable: read_scene raises the error

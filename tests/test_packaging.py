@@ -137,7 +137,7 @@ def test_installed_plugin_is_found_by_nerfstudio(installed):
         "print(sorted({p.name for g in ('method_configs', 'dataparser_configs') for p in e(group='nerfstudio.' + g)}))"
     )
     assert run(installed.python, "-c", code, cwd=installed.folder).strip() == str(
-        ["pointsplat", "replica-data", "scannetpp-seeded", "splatfacto-cpu"]
+        ["pointsplat", "pointsplat-authors", "pointsplat-paper", "replica-data", "scannetpp-seeded", "splatfacto-cpu"]
     )
 
 

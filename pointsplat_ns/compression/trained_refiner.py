@@ -136,7 +136,7 @@ def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None 
     """The ``pointsplat`` run at a path; arguments as of :func:`~pointsplat_ns.io.runs.open_run`. Raises SceneError if
     there is none, or it is damaged or of another kind."""
     run = open_run(path, need_data, data)
-    if run.method_name != METHOD_NAMES.refiner:
+    if not run.is_refiner:
         raise SceneError(
             f"{path}: a run of the method {run.method_name or 'unknown'}; expected a {METHOD_NAMES.refiner} run"
         )
@@ -163,8 +163,13 @@ def settings_from(saved: Mapping[str, Any]) -> PruneSettings:
 
 
 def network_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The network options in a run's model settings, as changes to the preset of its size."""
-    return {name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")}
+    """The network options in a run's model settings, as changes to the preset of its size. Runs of earlier versions
+    lack the later ones."""
+    later = ("enc_depths", "stem", "raw_inputs", "means_reach")
+    return {
+        **{name: settings[name] for name in ("encoder", "use_appearance", "use_position", "norm")},
+        **{name: settings[name] for name in later if settings.get(name) is not None},
+    }
 
 
 def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:

@@ -50,7 +50,7 @@ class MethodNames:
     scene: str = "splatfacto-cpu"
     """Trains scenes."""
     refiner: str = "pointsplat"
-    """Trains refiners."""
+    """Trains refiners; so do its presets, whose names begin with this and a hyphen."""
 
 
 METHOD_NAMES = MethodNames()
@@ -87,9 +87,14 @@ class Run:
     """Scene units per unit of the transformed data."""
 
     @property
+    def is_refiner(self) -> bool:
+        """Whether the checkpoint holds a refiner for many scenes."""
+        return self.method_name == METHOD_NAMES.refiner or self.method_name.startswith(f"{METHOD_NAMES.refiner}-")
+
+    @property
     def is_gaussian_scene(self) -> bool:
         """Whether the checkpoint holds one Gaussian scene: Splatfacto or a method derived from it."""
-        if self.method_name == METHOD_NAMES.refiner:  # a refiner for many scenes
+        if self.is_refiner:
             return False
         # Methods derived from Splatfacto have these settings, too.
         needed = {"sh_degree", "densify_grad_thresh", "rasterize_mode"}

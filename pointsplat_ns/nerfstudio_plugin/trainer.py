@@ -238,10 +238,15 @@ class StoppableTrainer(Trainer):
         if not skipped:
             for name in names:
                 processes.average_gradients(self._trained(name))
+            self.clip(names)
             self.optimizers.optimizer_scaler_step_some(self.grad_scaler, names)
             self.grad_scaler.update()
         if scale <= self.grad_scaler.get_scale():  # as in nerfstudio: not if the scaler skipped the update
             self.optimizers.scheduler_step_all(step)
+
+    def clip(self, names: list[str]) -> None:
+        """Limit the gradients of these groups together, before each optimiser limits those of its own group; by default
+        they are left alone."""
 
     def _trained(self, group: str) -> list[nn.Parameter]:
         """Parameters of a group: its optimiser has them, also where densification renews them."""

@@ -13,6 +13,7 @@ from pointsplat_ns.gaussians import MAX_SH_DEGREE
 _NAMES = {
     "encoder": ("dual", "concat"),
     "norm": ("scene", "batch", "layer"),
+    "stem": ("conv", "linear"),
     "curves": ("z", "z-trans", "hilbert", "hilbert-trans"),
 }
 
@@ -55,6 +56,12 @@ class RefinerConfig:
     """Hidden channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     color_dim: int = 8
     """Output channels of that MLP."""
+    raw_inputs: bool = False
+    """Give the encoder log-scales in units of the cube and opacity logits as they are. By default both are brought to
+    order 1, which softens the imbalance of one concatenated vector."""
+    stem: Literal["conv", "linear"] = "conv"
+    """First layer of the backbone, before its norm and GELU: a 3x3x3 convolution, or a linear layer of each point (the
+    published code)."""
     grid: int | None = 384
     """Cells along the unit cube at the finest level (at most 512); None adapts the cell to the spacing of the scene."""
     strides: tuple[int, ...] = (1, 2, 2, 2)

@@ -97,12 +97,12 @@ NORMS: dict[str, Callable[[int], nn.Module]] = {"scene": SceneNorm, "batch": Bat
 
 @dataclass(frozen=True)
 class Features:
-    """The network's input for N Gaussians: finite, of order 1, the same for quaternions q and -q."""
+    """The network's input for N Gaussians: finite, of order 1 unless raw, the same for quaternions q and -q."""
 
     positions: Tensor  # [N, 3] unit cube, centred at 0
     quats: Tensor  # [N, 4] unit wxyz, first non-zero component positive
-    scales: Tensor  # [N, 3] log-scale in the unit cube, centred and scaled
-    opacities: Tensor  # [N, 1] logit, scaled
+    scales: Tensor  # [N, 3] log-scale in the unit cube, centred and scaled unless raw
+    opacities: Tensor  # [N, 1] logit, scaled unless raw
     features_dc: Tensor  # [N, 3]
     features_rest: Tensor  # [N, 3 * num_rest] zero above the scene's degree
     quat_scale: Tensor  # [N, 1] signed length: the scene's quaternion is this times ``quats``
@@ -285,7 +285,8 @@ class PointTransformer(nn.Module):
             each = zip(channels, heads, depths, strict=True)
             return nn.ModuleList(TransformerStage(c, h, config, [next(rates) for _ in range(d)]) for c, h, d in each)
 
-        self.embed = SubmanifoldConv(in_channels, enc[0], bias=False)
+        conv = config.stem == "conv"
+        self.embed = SubmanifoldConv(in_channels, enc[0], bias=False) if conv else linear(in_channels, enc[0])
         self.embed_out = nn.Sequential(NORMS[norm](enc[0]), nn.GELU())
         self.encoder = stages(enc, config.enc_heads, config.enc_depths)
         self.pools = nn.ModuleList(Pool(a, b, norm) for a, b in zip(enc[:-1], enc[1:], strict=True))
@@ -297,7 +298,8 @@ class PointTransformer(nn.Module):
     def forward(self, x: Tensor, structure: Structure) -> Tensor:
         """``[N, Cin] -> [N, backbone_dim]``, points in the structure's memory order."""
         levels = structure.levels
-        x = self.embed_out(self.embed(x, levels[0]))
+        conv = isinstance(self.embed, SubmanifoldConv)
+        x = self.embed_out(self.embed(x, levels[0]) if conv else self.embed(x))
         skips = []
         for i, stage in enumerate(self.encoder):
             if i:

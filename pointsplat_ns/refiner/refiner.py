@@ -91,7 +91,9 @@ class Refiner(nn.Module):
 
     def _refine(self, scene: Gaussians, structure: Structure) -> Gaussians:
         """The refined scene of usable Gaussians."""
-        features = gaussian_features(scene, structure.cube, self.config.num_rest, self.dtype)
+        features = gaussian_features(
+            scene, structure.cube, self.config.num_rest, self.dtype, raw=self.config.raw_inputs
+        )
         refined = _moved(scene, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
         if self.training or (sound := refined.usable()).all():
             return refined
@@ -134,24 +136,29 @@ def _put_back(rows: Gaussians, mask: Tensor, scene: Gaussians) -> Gaussians:
     return scene.replace(**{name: before.index_copy(0, place, after) for (name, before), after in values})
 
 
-def gaussian_features(scene: Gaussians, cube: UnitCube, num_rest: int, dtype: torch.dtype) -> Features:
+def gaussian_features(
+    scene: Gaussians, cube: UnitCube, num_rest: int, dtype: torch.dtype, raw: bool = False
+) -> Features:
     """Network input of a scene of N usable Gaussians, with its unit cube, for so many SH coefficients of degree 1 and
     higher a colour channel, in the network's floating type.
 
     Positions are centred and divided by one extent, which keeps the aspect ratio; log-scales are shifted by the
     logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
-    residuals are added to the original parameters. Trained weights depend on these units and limits.
+    residuals are added to the original parameters. Trained weights depend on these units and limits. With ``raw``,
+    log-scales in units of the cube and logits are clamped alike, but neither shifted nor scaled to order 1.
     """
     # -5 is a typical log-scale in the unit cube: 4 cm in a room of 6 m
-    log_scales = (cube.log_scales(scene.scales) - -5.0) / 2.0
-    logits = scene.opacities.clamp(-12.0, 12.0) / 4.0  # beyond 12, opacity is 0 or 1 within 1e-5
+    centre, spread, logit_spread = (0.0, 1.0, 1.0) if raw else (-5.0, 2.0, 4.0)
+    log_scales = (cube.log_scales(scene.scales) - centre) / spread
+    low, high = ((bound - centre) / spread for bound in (-17.0, 7.0))
+    logits = scene.opacities.clamp(-12.0, 12.0) / logit_spread  # beyond 12, opacity is 0 or 1 within 1e-5
     sh_limit = 8.0  # displayable colours need at most 1.8
     quats, quat_scale = canonical_quats(scene.quats)
     rest = scene.features_rest.flatten(1).clamp(-sh_limit, sh_limit).to(dtype)
     return Features(
         positions=cube.positions(scene.means).to(dtype),
         quats=quats.to(dtype),
-        scales=log_scales.clamp(-6.0, 6.0).to(dtype),
+        scales=log_scales.clamp(low, high).to(dtype),
         opacities=logits.to(dtype),
         features_dc=scene.features_dc.clamp(-sh_limit, sh_limit).to(dtype),
         features_rest=torch.nn.functional.pad(rest, (0, 3 * num_rest - rest.shape[1])),

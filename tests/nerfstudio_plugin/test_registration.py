@@ -45,6 +45,8 @@ def case(name):
     from nerfstudio.plugins.types import MethodSpecification
     for spec, kind in ((method_configs.methods.splatfacto_cpu, MethodSpecification),
                        (method_configs.methods.pointsplat, MethodSpecification),
+                       (method_configs.methods.pointsplat_paper, MethodSpecification),
+                       (method_configs.methods.pointsplat_authors, MethodSpecification),
                        (method_configs.dataparsers.replica, DataParserSpecification),
                        (method_configs.dataparsers.scannetpp, DataParserSpecification)):
         assert isinstance(spec, kind), spec

@@ -31,7 +31,8 @@ def test_quaternions_of_any_length_become_unit_and_are_recovered(length):
     assert torch.allclose(unit * scale, q, rtol=5e-7, atol=1e-44)
 
 
-def test_features_of_extreme_parameters_are_finite_and_of_order_one():
+@pytest.mark.parametrize(("raw", "most"), [(False, 8), (True, 17)])
+def test_features_of_extreme_parameters_are_finite_and_bounded(raw, most):
     n = 6
     inf = torch.inf
     scene = Gaussians(
@@ -43,17 +44,34 @@ def test_features_of_extreme_parameters_are_finite_and_of_order_one():
         features_rest=torch.full((n, 3, 3), -1e30),
     )
     scene = scene.map(lambda value: value.clone().requires_grad_())
-    features = gaussian_features(scene, unit_cube(scene.means), num_rest=15, dtype=torch.float32)
+    features = gaussian_features(scene, unit_cube(scene.means), num_rest=15, dtype=torch.float32, raw=raw)
     total = 0
     for name in ("positions", "quats", "scales", "opacities", "features_dc", "features_rest"):
         value = getattr(features, name)
-        assert value.isfinite().all() and value.abs().max() <= 8, name
+        assert value.isfinite().all() and value.abs().max() <= most, name
         total = total + value.sum()
     assert features.features_rest.shape == (n, 45)
     assert (features.features_rest[:, 9:] == 0).all()
     total.backward()
     for name, value in scene.items():
         assert value.grad.isfinite().all(), name
+
+
+def test_raw_features_are_the_numbers_of_the_scene_in_a_unit_cube():
+    scene = normal_scene(50)
+    cube = unit_cube(scene.means)
+    features = gaussian_features(scene, cube, num_rest=15, dtype=torch.float32, raw=True)
+    assert torch.allclose(features.scales, scene.scales - cube.extent.float().log(), atol=1e-5)
+    assert torch.equal(features.opacities, scene.opacities) and torch.equal(features.features_dc, scene.features_dc)
+    usual = gaussian_features(scene, cube, num_rest=15, dtype=torch.float32)
+    assert torch.allclose(features.scales, 2 * usual.scales - 5, atol=1e-5)
+    assert torch.equal(features.positions, usual.positions) and torch.equal(features.quats, usual.quats)
+    for raw, expected in ((True, features), (False, usual)):
+        seen = []
+        refiner = Refiner(preset("tiny", raw_inputs=raw)).eval()
+        refiner.encoder.register_forward_pre_hook(lambda _, arguments, seen=seen: seen.append(arguments[0]))
+        refiner(scene)
+        assert torch.equal(seen[0].opacities.sort(dim=0).values, expected.opacities.sort(dim=0).values)
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -96,8 +96,9 @@ def test_a_scene_of_lower_degree_is_refined_as_if_padded_with_zeros(sh_degree):
         {"use_appearance": False},
         {"use_position": False},
         {"use_appearance": False, "use_position": False},
+        {"stem": "linear", "raw_inputs": True},
     ],
-    ids=["dual", "layer norm", "concat", "no appearance", "no position", "geometry only"],
+    ids=["dual", "layer norm", "concat", "no appearance", "no position", "geometry only", "linear stem"],
 )
 def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes):
     scene = scene_to_refine(400)

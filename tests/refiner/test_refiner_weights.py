@@ -31,9 +31,11 @@ def trained(**changes) -> Refiner:
     return move_zero_layers(Refiner(preset("tiny", enc_depths=(1, 1, 1), **changes)))
 
 
-@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
-def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, norm):
-    refiner = trained(norm=norm).train()
+@pytest.mark.parametrize(
+    "changes", [{"norm": "scene"}, {"norm": "batch", "stem": "linear", "raw_inputs": True}, {"norm": "layer"}], ids=str
+)
+def test_a_refiner_survives_a_round_trip_to_the_bit(tmp_path, changes):
+    refiner = trained(**changes).train()
     refiner(normal_scene(50))  # moves running statistics
     path = tmp_path / "new folder" / "refiner.safetensors"
     metadata = {"steps": 10, "command": "train --x 'y'", "psnr": [1.5, None]}

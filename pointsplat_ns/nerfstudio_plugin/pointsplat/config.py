@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import PointSplatError
@@ -36,6 +36,17 @@ network. Merged scenes need little repair, and high rates overfit: after 300 ste
 0.4 dB at 1e-4 and 0.1 dB at 2e-4. At 3e-4 and above (400 steps) it lost, although the two training rooms gained more at
 higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 learns faster."""
 
+RATES = {
+    "fast": REFINER_RATES,
+    "paper": dict.fromkeys(REFINER_RATES, 1e-5),  # section 4, Implementation details
+    "authors": {  # the optimiser of the released code
+        **dict.fromkeys(REFINER_RATES, 3e-5),
+        **dict.fromkeys(("means", "scales", "quats"), 1e-5),
+        "features_rest": 1e-6,
+    },
+}
+"""Learning rates by the names of :attr:`PointSplatTrainerConfig.rates`."""
+
 
 @dataclass
 class PointSplatTrainerConfig(StoppableTrainerConfig):
@@ -47,12 +58,16 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     time before the checkpoint of load_dir is part of it."""
     rates: Literal["fast", "paper", "authors"] = "fast"
     """Learning rates of the parts of the network: fast trains a small network in a few hundred steps, paper is 1e-5,
-    authors is the released code's 1e-6 to 3e-5. Rates set by hand are not changed."""
+    authors is the released code's 1e-6 to 3e-5. Rates set by hand, other than the method's own, are not changed."""
     rate_factor: float = 1.0
     """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3 learns faster and
     still generalises; so does 10 on scenes pruned by the paper's score."""
     schedule: Literal["cosine", "step"] = "cosine"
-    """How the rates fall: along a cosine after a short warm-up, or to a tenth at 60 % of the steps or of the time."""
+    """How the rates fall: along a cosine after a short warm-up, or to a tenth at once."""
+    drop_at: float = 0.6
+    """Share of the steps or of the time after which the schedule step has a tenth of the rates (the paper: 0.6)."""
+    global_norm: float | None = None
+    """Largest norm of all gradients together, in place of each optimiser's max-norm for its own part."""
 
     # Settings of nerfstudio's that have no effect here: hidden on the command line.
     gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
@@ -82,7 +97,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         self.timestamp = gathered([self.timestamp])[0]
 
     def setup(self, **kwargs) -> Trainer:
-        """Build the trainer with a copy of this config whose rates are set.
+        """Build the trainer with a copy of this config whose rates and limits of gradients are set.
 
         A resumed run ends ``max_num_iterations`` after the step that it resumes from, or when ``seconds`` are over, and
         so do its schedules: a run stopped at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had
@@ -90,29 +105,27 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         """
         if not 0 < self.rate_factor < math.inf:  # NaN fails too
             raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
+        if not 0 < self.drop_at < math.inf:
+            raise PointSplatError(f"--drop-at {self.drop_at:g}: expected a finite number above 0")
+        if self.global_norm is not None and not self.global_norm > 0:
+            raise PointSplatError(f"--global-norm {self.global_norm:g}: expected a number above 0")
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
-        rates = {
-            "fast": REFINER_RATES,
-            "paper": dict.fromkeys(REFINER_RATES, 1e-5),  # with schedule="step"
-            "authors": {  # of the released code, with the cosine schedule
-                **dict.fromkeys(REFINER_RATES, 3e-5),
-                **dict.fromkeys(("means", "scales", "quats"), 1e-5),
-                "features_rest": 1e-6,
-            },
-        }[self.rates]
+        registered = RATES.get((self.method_name or "").removeprefix(f"{METHOD_NAMES.refiner}-"), REFINER_RATES)
         for name, group in config.optimizers.items():
-            if group["optimizer"].lr == REFINER_RATES.get(name):
-                group["optimizer"].lr = rates[name]
+            if group["optimizer"].lr == registered.get(name):
+                group["optimizer"].lr = RATES[self.rates][name]
             group["optimizer"].lr *= self.rate_factor
+            if self.global_norm is not None:
+                group["optimizer"].max_norm = None
         _, together = torchrun_rank()
         if together > 1:  # nerfstudio, which did not start them, takes each for one alone
             kwargs |= {"local_rank": local_rank(), "world_size": together}
         return self._target(config, **kwargs)
 
 
-def pointsplat_config() -> TrainerConfig:
+def pointsplat_config() -> PointSplatTrainerConfig:
     """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
     return PointSplatTrainerConfig(
         method_name=METHOD_NAMES.refiner,

@@ -21,6 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
+from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
@@ -75,6 +76,17 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     norm: Literal["scene", "batch", "layer"] = "scene"
     """Normalisation outside the attention blocks. scene: statistics of the current scene, also in evaluation. batch:
     the published one, with running averages over the training scenes in evaluation. layer: per Gaussian."""
+    enc_depths: tuple[int, ...] | None = None
+    """Blocks in each stage of the backbone's encoder; by default those of size."""
+    stem: Literal["conv", "linear"] = "conv"
+    """First layer of the backbone: a convolution over neighbours, or a linear layer (the authors' code)."""
+    raw_inputs: bool = False
+    """Give the network log-scales and opacity logits as they are, not brought to order 1. With the encoder concat this
+    is the imbalance of features that the paper speaks of."""
+    means_reach: float = 0.05
+    """Largest move of a mean along an axis, as a share of the scene's extent (the authors' code: 1)."""
+    train_encoder: bool = True
+    """Train the encoder. The authors' code leaves it at its random weights."""
     pixel_loss: Literal["l1", "rmse"] = "l1"
     """Pixel loss: mean absolute difference, or root mean squared difference, which determines the PSNR."""
     lpips_weight: float = 0.1
@@ -99,12 +111,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
 
     def network_options(self) -> dict[str, Any]:
         """The options of the network that the preset of its size does not decide."""
-        return {
-            "encoder": self.encoder,
-            "use_appearance": self.use_appearance,
-            "use_position": self.use_position,
-            "norm": self.norm,
-        }
+        return network_options(vars(self))
 
     def check(self) -> None:
         """Raise a PointSplatError for settings that fit no scene."""
@@ -126,6 +133,7 @@ class PointSplatModel(SplatfactoModel):
         config is not valid."""
         self.config.check()
         self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
+        self.refiner.encoder.requires_grad_(self.config.train_encoder)
         self.crop_box: OrientedBox | None = None
         manager: ScenesDataManager = self.kwargs["datamanager"]
         self.scenes, self.shown = manager.scenes, manager.shown
@@ -152,8 +160,9 @@ class PointSplatModel(SplatfactoModel):
         return []
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """The network's parameters by part: encoder, backbone and one head per attribute."""
-        return self.refiner.parameter_groups()
+        """The network's parameters that are trained, by part: encoder, backbone and one head per attribute."""
+        groups = self.refiner.parameter_groups()
+        return {name: parts for name, parts in groups.items() if name != "encoder" or self.config.train_encoder}
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
         """A pruned scene and its neighbour tables, by its index. ``dense`` are its Gaussians, if they have been read

@@ -34,11 +34,12 @@ from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
 MODEL_METADATA = (
-    "size", "by", "keep", "more_keeps", "opacity_weight", "norm", "pixel_loss", "lpips_weight", "lpips_net",
+    "size", "by", "keep", "more_keeps", "opacity_weight", "norm", "train_encoder", "pixel_loss", "lpips_weight",
+    "lpips_net",
 )  # fmt: skip
 """Settings of the model in the metadata of a saved network."""
 
-TRAINER_METADATA = ("rates", "rate_factor", "schedule")
+TRAINER_METADATA = ("method_name", "rates", "rate_factor", "schedule", "drop_at", "global_norm")
 """Settings of the trainer in the metadata of a saved network."""
 
 LOOK_AHEAD = 4

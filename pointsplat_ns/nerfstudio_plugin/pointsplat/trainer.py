@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch.nn.utils import clip_grad_norm_
 from torch.optim.lr_scheduler import LambdaLR
 
 from pointsplat_ns.compression.repair import rate_factor
@@ -26,11 +27,11 @@ SECONDS_BETWEEN_CHECKPOINTS = 600.0
 """A training that is killed loses at most this time, however slow its steps are."""
 
 
-def rate_factor_at(share: float, schedule: Literal["cosine", "step"]) -> float:
+def rate_factor_at(share: float, schedule: Literal["cosine", "step"], drop_at: float = 0.6) -> float:
     """Learning rate over its peak, when a share of the training has passed. ``cosine``: from 0 linearly to 1 at 5 %,
-    then along a cosine to 0.02 at the end. ``step``: 1, and 0.1 from 60 % on (6,000 of 10,000 steps in the paper)."""
+    then along a cosine to 0.02 at the end. ``step``: 1, and 0.1 from the share ``drop_at`` on."""
     if schedule == "step":
-        return 1.0 if share < 0.6 else 0.1
+        return 1.0 if share < drop_at else 0.1
     warm_up, last = 0.05, 0.02
     if share < warm_up:
         return share / warm_up
@@ -59,7 +60,8 @@ class PointSplatTrainer(StoppableTrainer):
         for name, optimizer in optimizers.optimizers.items():
             if name not in optimizers.schedulers:
                 optimizers.schedulers[name] = LambdaLR(
-                    optimizer, lambda steps: rate_factor_at(self.share(steps), self.config.schedule)
+                    optimizer,
+                    lambda steps: rate_factor_at(self.share(steps), self.config.schedule, self.config.drop_at),
                 )
         return optimizers
 
@@ -100,6 +102,14 @@ class PointSplatTrainer(StoppableTrainer):
                 self.stop_training, self._last_step = True, step
                 CONSOLE.log(f"the time is over: {step + 1} steps in {pipeline.seconds:.0f} s")
         super().update(step, names, skipped)
+
+    def clip(self, names: list[str]) -> None:
+        """Scale all gradients down to the norm ``global_norm`` of the config, if it is set and they exceed it."""
+        if self.config.global_norm is not None:
+            if self.grad_scaler.is_enabled():
+                for name in names:
+                    self.grad_scaler.unscale_(self.optimizers.optimizers[name])
+            clip_grad_norm_([p for name in names for p in self._trained(name)], self.config.global_norm)
 
     def _after_train(self) -> None:
         """As nerfstudio's, which counts the step before which it stops as done."""

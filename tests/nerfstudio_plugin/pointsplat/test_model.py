@@ -162,6 +162,7 @@ def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
     assert means == {"average": pytest.approx((seen + unseen) / 2), "average_seen": seen, "average_unseen": unseen}
     assert found["psnr"] == unseen and found["psnr_std"] > 0
     network = {"size": "tiny", "encoder": "dual", "use_appearance": True, "use_position": True, "norm": "scene"}
+    network |= {"stem": "conv", "raw_inputs": False, "means_reach": 0.05}
     assert found["settings"] == {**network, "keep": 0.5, "by": "paper", "opacity_weight": None}
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
