@@ -206,5 +206,5 @@ def _uncompared(result: Compacted) -> str:
 def _figures(before: Closeness, after: Closeness) -> str:
     """Text with the errors before and after."""
     gain = f"{before.psnr:.1f} -> {after.psnr:.1f} dB PSNR against the dense scene"
-    worst = f"worst {before.worst:.1f} -> {after.worst:.1f} dB, closer in {closer_in(before, after)}"
+    worst = f"worst {before.worst:.1f} -> {after.worst:.1f} dB, better in {closer_in(before, after)}"
     return f"{gain} ({before.where}; {worst})"

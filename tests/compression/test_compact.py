@@ -102,7 +102,7 @@ def test_a_refiner_that_helps_is_kept_with_the_figures_of_its_renders(scene, vie
     assert (result.after.psnr, result.after.worst) == after
     assert result.verdict == (
         f"refined by the network: {before[0]:.1f} -> {after[0]:.1f} dB PSNR against the dense scene "
-        f"(3 views of {views.width} pixels; worst {before[1]:.1f} -> {after[1]:.1f} dB, closer in 3)"
+        f"(3 views of {views.width} pixels; worst {before[1]:.1f} -> {after[1]:.1f} dB, better in 3)"
     )
 
 
