@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 
 from pointsplat_ns.compression.compacted import Compacted, last_kept
 from pointsplat_ns.compression.optimiser import Example
@@ -126,9 +125,9 @@ def _posed_files(
             f"{folder}: no poses there, above it or beside the scene; name them (--poses): a COLMAP model, "
             "transforms.json of nerfstudio, or cameras.json of 3DGS"
         )
+    transforms = None if scene is None else transforms_beside(scene)
     why = ""
     for place in places:
-        transforms = transforms_beside(scene) if scene is not None else None
         try:
             named = read_named_views(place, transforms)
         except (DataError, SceneError) as error:
@@ -196,24 +195,10 @@ def _outliers(dense: Gaussians, examples: dict[int, Example], progress: Progress
     drawn = thinned(dense, POSE_CHECK.max_count)
     psnrs = {}
     for done, (index, example) in enumerate(examples.items()):
-        psnrs[index] = likeness(drawn, [_small(example)]).psnr
+        psnrs[index] = likeness(drawn, [example]).psnr
         progress("comparing photos with the scene", (done + 1) / len(examples))
     values = torch.tensor([*psnrs.values()], **DOUBLES)
     middle = float(values.median())
     deviation = 1.4826 * float((values - middle).abs().median())
     bound = middle - max(6.0, 4 * deviation)
     return dict(sorted(((index, psnr) for index, psnr in psnrs.items() if psnr < bound), key=lambda pair: pair[1]))
-
-
-def _small(example: Example) -> Example:
-    """A photo of the size of small renders."""
-    view = example.view
-    k = max(1, max(view.width, view.height) // POSE_CHECK.side)
-    width, height = max(1, view.width // k), max(1, view.height // k)
-    image = F.interpolate(example.target.permute(2, 0, 1)[None].float() / 255, (height, width), mode="area")[0]
-    mask = example.mask
-    if mask is not None:
-        mask = F.interpolate(mask.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].ge(0.5)
-        mask = mask.permute(1, 2, 0)
-    stretch = view.K.new_tensor([[width / view.width], [height / view.height], [1.0]])
-    return Example(replace(view, K=view.K * stretch, width=width, height=height), image.permute(1, 2, 0), mask)

@@ -55,12 +55,13 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
     """
     search = _Search(scene, named, photos, model)
     given = search.fit(search.poses)
-    words, poses = search.best()
-    found = search.fit(poses)
+    found, words, poses = search.best(given)
     search.background = 1.0
-    if not _fits(found):
-        words, poses = search.best()
-    if (white := search.fit(poses)).psnr > found.psnr + 1.0 and _fits(white):
+    if _fits(found):
+        white = search.fit(poses)
+    else:
+        white, words, poses = search.best(search.fit(search.poses))
+    if white.psnr > found.psnr + 1.0 and _fits(white):
         found = white
         logger.info("the photos have a white background")
     else:
@@ -114,10 +115,9 @@ class _Search:
             shown.append((replace(own, K=view.K, width=view.width, height=view.height), image, mask))
         return likeness(self._drawn, shown)
 
-    def best(self) -> tuple[list[str], Tensor]:
-        """What leads to the frame with the greatest likeness, and poses in it."""
-        found = given = self.fit(self.poses)
-        words, poses = "", self.poses
+    def best(self, given: Likeness) -> tuple[Likeness, list[str], Tensor]:
+        """The greatest likeness, what leads to its frame, and poses in it; ``given`` is that of the given frame."""
+        found, words, poses = given, "", self.poses
         others = [self._known]
         if given.own < 0.75 or not _fits(given):
             others.append([*_turned_frames([frame for frame in self._known if frame[0] in ("", _GSPLAT)])])
@@ -127,9 +127,11 @@ class _Search:
                 found, words, poses = other, text, best
         start = poses
         scale = _best_scale(lambda factor: self.fit(_scaled(start, factor)).own)
+        named = [words] if words else []
         if abs(scale - 1) <= SAME_SCALE:
-            return [words] if words else [], poses
-        return [*filter(None, [words]), f"positions times {scale:.4g}"], _scaled(poses, scale)
+            return found, named, poses
+        scaled = _scaled(poses, scale)
+        return self.fit(scaled), [*named, f"positions times {scale:.4g}"], scaled
 
 
 def _scaled(poses: Tensor, factor: float) -> Tensor:

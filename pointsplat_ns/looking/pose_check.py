@@ -157,7 +157,7 @@ def likeness(scene: Gaussians, photos: Sequence[Photo], settings: PoseCheckSetti
         small = replace(view, K=view.K * stretch, width=size[1], height=size[0])
         counted = torch.ones(1, *photo.shape[:2], **FLOATS) if mask is None else mask.permute(2, 0, 1).cpu()
         weight = F.adaptive_avg_pool2d(counted.double(), size).ge(0.5).double()
-        picture = F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1).double().cpu(), size) * weight
+        picture = F.adaptive_avg_pool2d(in_unit_range(photo).permute(2, 0, 1), size).double().cpu() * weight
         rendered = render(drawn, small).permute(2, 0, 1).double().cpu() * weight
         counted_share = max(float(weight.mean()), 1e-9)
         psnrs.append(min(psnr_of(float((rendered - picture).square().mean()), counted_share), MOST_PSNR))
