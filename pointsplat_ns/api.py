@@ -193,7 +193,8 @@ def compact(
         refiner: from :func:`load_refiner`; by default none.
         by: the method, as for :func:`prune`; by default that of the refiner's training, or "merge".
         sh, clean: as for :func:`prune`.
-        effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200.
+        effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200, up to four times as many for
+            more than 20,000 Gaussians.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
             or for ``seconds``. Photos in and outside of the steps say whether the result is better.

@@ -96,7 +96,8 @@ def compact(
         by: the method of prune; by default the method of the refiner's training; without a refiner merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
-        effort: length of the repair: no steps (instant), 192 (quick), or 1200 (thorough).
+        effort: length of the repair: no steps (instant), 192 (quick), or 1200 (thorough); up to four times as many for
+            more than 20,000 Gaussians.
         seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
             the scene so far.
         photos: after the repair also train on photos, by 1200 steps (quick) or 12000 (thorough), or for --seconds.

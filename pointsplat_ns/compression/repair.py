@@ -15,7 +15,7 @@ from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Example, optimised
 from pointsplat_ns.compression.requests import STEPS, Effort, RepairBudget
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.system.threads import one_thread
@@ -53,7 +53,7 @@ def repair(
         scene: K Gaussians; not changed.
         dense: N Gaussians on the same device.
         views: source of views.
-        budget: length of the repair.
+        budget: length of the repair, for a scene of few Gaussians; see :meth:`RepairBudget.for_count`.
         progress: called with the share done, in [0, 1].
         network: on the scene's device; by default the shipped one, None for plain Adam.
         psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB. Above
@@ -62,6 +62,7 @@ def repair(
     Raises:
         DataError: if nothing of the scene is visible.
     """
+    budget = budget.for_count(len(scene))
     run = OptimisationRun(budget)
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
@@ -79,7 +80,11 @@ def repair(
         nonlocal scene
         scene = after
 
-    run.take(optimised(scene, feedback, _examples(dense, views), choose), keep, progress)
+    run.take(
+        optimised(scene, feedback, _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped)), choose),
+        keep,
+        progress,
+    )
     return Repaired(scene, run.count, run.seconds, run.interrupted)
 
 
@@ -127,9 +132,9 @@ class OptimisationRun:
             self.interrupted = True
 
 
-def _examples(dense: Gaussians, views: ViewSource) -> Iterator[Example]:
-    """Views and renders of the dense scene in them, without end."""
-    for view in views.others():
+def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:
+    """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end."""
+    for view in views.others(count=count):
         with torch.no_grad():
             target = render(dense, view)
         yield Example(view, target)

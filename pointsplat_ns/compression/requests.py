@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -28,7 +28,10 @@ SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 192, "thorough": 1200}
-"""Number of repair steps of each effort."""
+"""Number of repair steps of each effort, for at most :data:`FEW` Gaussians."""
+
+FEW = 20_000
+"""Number of Gaussians above which a repair takes more steps, in more views."""
 
 
 PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 1200, "thorough": 12000}
@@ -49,6 +52,8 @@ class RepairBudget:
     """Number of steps, see :data:`STEPS`. The result does not depend on the speed of the machine."""
     seconds: float | None = None
     """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
+    growth: float = 1.0
+    """Factor on the number of steps, and of sampled views."""
 
     def __post_init__(self) -> None:
         if self.effort not in STEPS:
@@ -59,7 +64,17 @@ class RepairBudget:
     @property
     def steps(self) -> int:
         """Number of steps of the effort."""
-        return STEPS[self.effort]
+        return round(self.growth * STEPS[self.effort])
+
+    def for_count(self, count: int) -> RepairBudget:
+        """The budget for a scene of ``count`` Gaussians. Steps grow with the root of the count, to four times as many:
+        a view shows more Gaussians of a large scene, and a smaller share of them.
+
+        Example:
+            >>> [RepairBudget().for_count(count).growth for count in (5_000, 80_000, 320_000, 5_000_000)]
+            [1.0, 2.0, 4.0, 4.0]
+        """
+        return replace(self, growth=min(max(math.sqrt(count / FEW), 1.0), 4.0))
 
     @property
     def empty(self) -> bool:

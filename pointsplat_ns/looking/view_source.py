@@ -28,7 +28,7 @@ class ViewCounts:
     compared: int = 12
     """Views in which renders are compared."""
     stepped: int = 96
-    """Sampled views for the steps of repairs."""
+    """Sampled views for the steps of repairs of few Gaussians."""
     scored: int = 40
     """Views for methods that score by views."""
     opening: int = 24
@@ -165,7 +165,7 @@ class ViewSource:
         """At most ``count`` views for scores, of the size of :meth:`compared`."""
         return middle_sized(self.views(count))
 
-    def others(self, seed: int = 0) -> Iterator[View]:
+    def others(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
         is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
         (:func:`~pointsplat_ns.looking.sizes.two_sizes`), the next time the other way around.
@@ -175,17 +175,18 @@ class ViewSource:
 
         Args:
             seed: seed of the order, and of sampled views.
+            count: number of different sampled views.
 
         Raises:
             DataError: if none can be sampled.
         """
         compared, left = self.compared(), self._not_compared()
         if left is None:
-            yield from self.sampled(seed)
+            yield from self.sampled(seed, count)
         elif len(left) > len(compared):
             yield from self._in_turn(left, seed)
         else:
-            for pair in zip(self._in_turn(left, seed), self.sampled(seed), strict=False):  # neither ends
+            for pair in zip(self._in_turn(left, seed), self.sampled(seed, count), strict=False):  # neither ends
                 yield from pair
 
     def _not_compared(self) -> Views | None:

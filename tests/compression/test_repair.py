@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import pointsplat_ns.compression.repair as repair_module
+import pointsplat_ns.compression.requests as requests
 from making import FewViews, ball, same
 from pointsplat_ns.api import example_room
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
@@ -49,6 +50,20 @@ def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, 
     assert all(torch.equal(a, b) for a, b in zip(before, pruned.tensors(), strict=True)), "the input was changed"
     assert repaired.steps == STEPS["quick"] and not repaired.interrupted and repaired.seconds > 0
     assert shares == pytest.approx([(i + 1) / STEPS["quick"] for i in range(STEPS["quick"])])
+
+
+def test_repairs_of_many_gaussians_take_more_steps_in_more_views(hollow_ball, pruned, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 4)
+    monkeypatch.setattr(requests, "FEW", 75)
+    asked = []
+
+    class Counted(FewViews):
+        def others(self, seed=0, count=0):
+            asked.append(count)
+            return self.sampled(seed)
+
+    repaired = repair(pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None)
+    assert repaired.steps == 8 and asked == [2 * VIEW_COUNTS.stepped]
 
 
 def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
