@@ -142,10 +142,14 @@ class DenseViews:
         if not self.views:
             raise SystemExit("no view shows the scene; expected at least one")
 
-    @torch.no_grad()
     def psnr(self, small: Gaussians) -> float:
         """Mean over views of :func:`covered_psnr`, dB."""
-        return fmean(covered_psnr(render(small, view), image, share) for view, image, share in self.views)
+        return fmean(self.psnrs(small))
+
+    @torch.no_grad()
+    def psnrs(self, small: Gaussians) -> list[float]:
+        """:func:`covered_psnr` of each view, dB."""
+        return [covered_psnr(render(small, view), image, share) for view, image, share in self.views]
 
 
 @torch.no_grad()

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from lab.judge import camera_paths, judge, record, scenes
+import pointsplat_ns as ps
+from lab.judge import camera_paths, judge, levels, record, scenes
 from peers import peer
 
 PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
@@ -86,3 +87,13 @@ def test_means_and_leads_are_over_scenes_that_have_every_way():
         figures.scenes(960) == "2" and "| 10 % | 26.00 (24.00 rock) | 27.50 (25.00 rock) | 29.00 (27.00 rock) |" in text
     )
     assert "| 10 % | +1.50 (+1.00 rock) | +1.50 (+1.00 chair) |" in text
+
+
+def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_path, capsys):
+    ps.lod(small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48))
+    results = tmp_path / "levels.json"
+    levels.main(tmp_path / "stream" / "lod-meta.json", "small", widths=(32, 64), json_path=results)
+    rows = json.loads(results.read_text())
+    assert [(row["way"], row["count"]) for row in rows] == [(w, n) for w in ("its level", "prune") for n in (360, 180)]
+    assert all(row["worst_64"] < row["mean_64"] < 60 for row in rows)
+    assert "900 Gaussians" in capsys.readouterr().out
