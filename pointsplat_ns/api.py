@@ -24,7 +24,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats import STREAM_META, format_to_write
-from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.outputs import claimed, claimed_folder
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.folder import check_folder, check_level_folder
@@ -263,7 +263,8 @@ def lod(
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
-        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
+        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`. A name that ends in
+            .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
@@ -294,8 +295,11 @@ def lod(
     if at is not None:
         Place.parse(at)
     viewer = web_viewer() if html else None
+    paged = folder is not None and Path(folder).suffix.lower() == ".rad" and not (stream or tiles)
     with ExitStack() as stack:
-        if folder is not None:
+        if folder is not None and paged:
+            stack.enter_context(claimed(Path(folder), force))
+        elif folder is not None:
             if stream or tiles:
                 check_folder(Path(folder), (TILESET if tiles else STREAM_META, *(viewer or ())), force)
             else:
@@ -311,6 +315,8 @@ def lod(
         made = make_levels(dense, levels, sh, view_source, source, report)
         if folder is not None and stream:
             made.save_stream(folder, force, report, page)
+        elif folder is not None and paged:
+            made.save_paged(folder, report)
         elif folder is not None and tiles:
             made.save_tiles(folder, at, up, force, report)
         elif folder is not None:

@@ -26,6 +26,7 @@ from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth, pixel_size_for
 from pointsplat_ns.levels.folder import write_levels
+from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.levels.tiles import placed, write_tiles
 from pointsplat_ns.looking.closeness import DenseReference, Reference
@@ -148,6 +149,11 @@ class Levels:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
         return write_stream(folder, self.scenes, self.parents, force, progress, page)
+
+    def save_paged(self, path: str | Path, progress: Progress = silent) -> int:
+        """Write the levels as a RAD file, as ``pointsplat lod -o room.rad`` does; see
+        :func:`~pointsplat_ns.levels.paged.write_paged`. Returns the number of its Gaussians."""
+        return write_paged(path, self.scenes, self.parents, progress)
 
     def save_tiles(
         self,

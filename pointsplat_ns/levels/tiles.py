@@ -38,8 +38,8 @@ PIXELS = 16.0
 def placed(
     levels: Sequence[Gaussians], dense: Gaussians, at: str | None, up: str | None
 ) -> tuple[list[Gaussians], Tensor]:
-    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64 from there to the frame
-    of tiles: that of the scene's file, or the Earth's.
+    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64 from there to the
+    frame of tiles: that of the scene's file, or the Earth's.
 
     Args:
         levels: the finest first.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Union
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 
-Parts = Union[Tensor, tuple["Parts", "Parts"]]
+Parts: TypeAlias = "Tensor | tuple[Parts, Parts]"
 """Indices of points, or two such parts."""
 
 
