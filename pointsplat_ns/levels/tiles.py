@@ -146,7 +146,7 @@ def _box(scene: Gaussians) -> tuple[Tensor, Tensor]:
 
 def _node(corners: Tensor | None, children: list[dict[str, Any]], error: float) -> dict[str, Any]:
     """A tile without content, with the box of its own corners (2, 3) and those of its children."""
-    boxes = torch.tensor([child["boundingVolume"]["box"] for child in children]).double().reshape(-1, 12)
+    boxes = torch.tensor([child["boundingVolume"]["box"] for child in children], **DOUBLES).reshape(-1, 12)
     middle, half = boxes[:, :3], boxes[:, 3::4]
     points = torch.cat([middle - half, middle + half, *([] if corners is None else [corners])])
     low, high = points.aminmax(dim=0)

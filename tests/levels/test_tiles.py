@@ -115,7 +115,7 @@ def test_a_tileset_says_what_viewers_ask_for(tmp_path):
     assert {tile["geometricError"] for tile, _ in tiles} == {8.0, 0.0}, "a coarser level has no smaller error"
     for tile, above in tiles:
         inner, outer = (np.array(of["boundingVolume"]["box"]) for of in (tile, above))
-        assert (np.abs(inner[:3] - outer[:3]) + inner[3::4] <= outer[3::4] + 1e-5).all()
+        assert (np.abs(inner[:3] - outer[:3]) + inner[3::4] <= outer[3::4] + 1e-12).all()
 
 
 @pytest.mark.parametrize(

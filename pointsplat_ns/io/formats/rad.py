@@ -7,7 +7,6 @@ after the other, deflated. The root is the first Gaussian, and children of a Gau
 from __future__ import annotations
 
 import json
-import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -48,21 +47,24 @@ def encode_rad(scene: Gaussians, children: Tensor, starts: Tensor, progress: Pro
         progress: called while compressing.
     """
     n, degree, encoding = len(scene), scene.sh_degree, _ranges(scene)
-    pages, places, offset = [], [], 0
+    pages: list[bytes] = []
+    places: list[dict[str, int]] = []
+    offset = 0
     for first in range(0, n, _PAGE):
         progress("compressing", first / n)
         rows = slice(first, first + _PAGE)
-        arrays, payload, properties = _attributes(scene[rows], encoding, children[rows], starts[rows]), [], []
-        for (name, kind, bounds), array in arrays:
+        payload: list[bytes] = []
+        properties: list[dict[str, Any]] = []
+        size = 0
+        for (name, kind, bounds), array in _attributes(scene[rows], encoding, children[rows], starts[rows]):
             packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, -15)
             packed = packer.compress(array.tobytes()) + packer.flush()
-            at = sum(map(len, payload))
-            about = {"offset": at, "bytes": len(packed), "property": name, "encoding": kind, "compression": "gz"}
+            about = {"offset": size, "bytes": len(packed), "property": name, "encoding": kind, "compression": "gz"}
             properties.append({**about, **bounds})
             payload.append(_padded(packed))
-        size = sum(map(len, payload))
-        page = {"version": 1, "base": first, "count": len(children[rows]), "payloadBytes": size, "maxSh": degree}
-        page.update(lodTree=True, splatEncoding=encoding, properties=properties)
+            size += len(payload[-1])
+        page: dict[str, Any] = {"version": 1, "base": first, "count": len(children[rows]), "payloadBytes": size}
+        page.update(maxSh=degree, lodTree=True, splatEncoding=encoding, properties=properties)
         pages.append(b"".join([_described(b"RADC", page), struct.pack("<Q", size), *payload]))
         places.append({"offset": offset, "bytes": len(pages[-1])})
         offset += len(pages[-1])
@@ -85,15 +87,16 @@ def _padded(data: bytes) -> bytes:
 def _ranges(scene: Gaussians) -> dict[str, Any]:
     """The ranges of bytes: of colours, of SH by degree, and those in which viewers keep sizes."""
     colours = np.quantile(shares_of_dc(scene), [0.001, 0.999])
-    sizes = scene.scales.clamp(-30.0, 30.0)  # of flat axes, too
+    finite = scene.scales[scene.scales.isfinite()].double().numpy()  # without flat axes
+    sizes = np.quantile(finite, [0.001, 1.0]) if len(finite) else np.zeros(2)
     limits = {f"sh{degree}Max": 1.0 for degree in (1, 2, 3)}
     for degree in range(1, scene.sh_degree + 1):
         limits[f"sh{degree}Max"] = max(float(_band(scene, degree).abs().max()), 1e-3)
     return {
         "rgbMin": min(float(colours[0]), 0.0),
         "rgbMax": max(float(colours[1]), 1.0),
-        "lnScaleMin": math.floor(float(sizes.min())) - 1.0,
-        "lnScaleMax": math.ceil(float(sizes.max())) + 1.0,
+        "lnScaleMin": float(sizes[0]) - 0.5,
+        "lnScaleMax": float(sizes[1]) + 0.5,
         **limits,
         "lodOpacity": True,
     }
