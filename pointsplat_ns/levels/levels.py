@@ -182,7 +182,7 @@ class Levels:
         """Scene units a pixel from which on each level shows enough; without views, the typical size of its
         Gaussians."""
         if self.reference is None or self.distance is None:
-            return [float(typical_sizes(scene.cpu()).median()) for scene in self.scenes]
+            return [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
         pixel = self.distance / float(self.reference.views.Ks[:, 1, 1].median())
         return [pixel_size_for(level.errors, self.farther, pixel) for level in self if level.errors is not None]
 

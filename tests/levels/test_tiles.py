@@ -4,6 +4,7 @@ import gzip
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,15 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
         with pytest.raises(SystemExit):
             main(["lod", str(tmp_path / "room.ply"), *options])
         assert words in capsys.readouterr().err
+
+
+def test_levels_without_views_have_the_errors_of_their_sizes(tmp_path):
+    scene = ball(300, opacity=1.0, bright=1.0)
+    made = replace(ps.lod(scene, ["100%", "10%"], views=ps.sample_views(scene, 2, 48, 36)), reference=None)
+    assert made.save_tiles(tmp_path) == [300, 30]
+    _, tiles = tiles_of(tmp_path)
+    wanted = 16 * float(made[1].scene.stds.median(dim=1).values.median())
+    assert max(tile["geometricError"] for tile, _ in tiles) == pytest.approx(wanted, rel=1e-5)
 
 
 def errors(*psnr: float) -> RenderErrors:
