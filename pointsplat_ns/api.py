@@ -22,12 +22,14 @@ from pointsplat_ns.compression.trained_refiner import (
 )
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats import STREAM_META, format_to_write
-from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.outputs import claimed, claimed_folder
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.folder import check_folder, check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
+from pointsplat_ns.levels.tiles import TILESET
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page
@@ -246,6 +248,8 @@ def lod(
     folder: str | Path | None = None,
     stream: bool = False,
     html: bool = False,
+    tiles: bool = False,
+    at: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
@@ -260,9 +264,11 @@ def lod(
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
-        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`.
+        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`. A name that ends in
+            .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
         html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
+        tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
         force: overwrite existing files in ``folder``.
 
     Returns:
@@ -285,11 +291,18 @@ def lod(
     PruneRequest(1.0, sh=sh)
     if html and (not stream or folder is None):
         raise PointSplatError("a page is written beside a stream; expected --stream with --html")
+    if stream and tiles or at is not None and not tiles:
+        raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
+    if at is not None:
+        Place.parse(at)
     viewer = web_viewer() if html else None
+    paged = folder is not None and Path(folder).suffix.lower() == ".rad" and not (stream or tiles)
     with ExitStack() as stack:
-        if folder is not None:
-            if stream:
-                check_folder(Path(folder), (STREAM_META, *(viewer or ())), force)
+        if folder is not None and paged:
+            stack.enter_context(claimed(Path(folder), force))
+        elif folder is not None:
+            if stream or tiles:
+                check_folder(Path(folder), (TILESET if tiles else STREAM_META, *(viewer or ())), force)
             else:
                 check_level_folder(Path(folder), len(budgets), force)
             stack.enter_context(claimed_folder(Path(folder)))
@@ -303,6 +316,10 @@ def lod(
         made = make_levels(dense, levels, sh, view_source, source, report)
         if folder is not None and stream:
             made.save_stream(folder, force, report, page)
+        elif folder is not None and paged:
+            made.save_paged(folder, report)
+        elif folder is not None and tiles:
+            made.save_tiles(folder, at, up, force, report)
         elif folder is not None:
             made.save(folder, force)
     log((*made.notes, *([page.note] if page else [])))

@@ -21,6 +21,8 @@ def lod(
     output: options.Output = None,
     stream: bool = False,
     html: bool = False,
+    tiles: bool = False,
+    at: str | None = None,
     sh: options.Bands = "all",
     poses: options.Poses = None,
     resolution: options.Resolution = None,
@@ -33,7 +35,7 @@ def lod(
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
     With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers load the parts that
-    they need; with --html besides, a viewer for the web beside it.
+    they need; with --html besides, a viewer for the web beside it. With --tiles, they are written as 3D Tiles.
 
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
     are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
@@ -44,11 +46,16 @@ def lod(
             file (12MB).
         output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
             picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run. With
-            --stream, the folder for lod-meta.json and its SOG files, by default room_stream.
+            --stream, the folder for lod-meta.json and its SOG files, by default room_stream; with --tiles, that for
+            tileset.json and its glTF files, by default room_tiles. A name that ends in .rad is a file for Spark.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
         html: write PlayCanvas' SuperSplat viewer beside the stream, which is turned until -y is up, as viewers show
             it. Any web server can serve the folder. The viewer (npm, MIT, 3 MB) is downloaded, or comes from the
             tarball that the environment variable POINTSPLAT_WEB_VIEWER names.
+        tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
+        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or the latitude,
+            longitude and height of its origin in degrees and metres (48.86,2.29,35; --at=-33.9,... in the south), with
+            up turned to the zenith. By default they have the frame of the scene's file.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         json_output: print the manifest, and nothing else on standard output.
     """
@@ -59,13 +66,14 @@ def lod(
 
     options.need_one_scene(scene)
     options.check_poses(poses)
-    folder = output or options.output_beside(scene, "stream" if stream else "lod").with_suffix("")
+    folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod").with_suffix("")
+    for_viewers = stream or tiles or folder.suffix.lower() == ".rad"
     with fixed_threads(threads):
         made = ps.lod(
-            scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            data=data, folder=folder, stream=stream, html=html, force=force, progress=True,
+            scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
+            data=data, folder=folder, stream=stream, html=html, tiles=tiles, at=at, force=force, progress=True,
         )  # fmt: skip
-    if json_output and stream:
+    if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
     elif json_output:
         print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})

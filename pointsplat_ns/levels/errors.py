@@ -10,6 +10,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, Reference
 from pointsplat_ns.rasterizer import render_depth
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,30 @@ class RenderErrors:
     """In the compared views."""
     farther: dict[int, float]
     """PSNR in dB by multiple of the distance, see :func:`far_references`."""
+
+
+ENOUGH = 30.0
+"""PSNR in dB against the dense scene from which on a level is taken to show as much, see :func:`pixel_size_for`."""
+
+
+def pixel_size_for(errors: RenderErrors, farther: dict[int, float], pixel_size: float) -> float:
+    """Scene units a pixel from which on a level shows enough: its PSNR is :data:`ENOUGH`, or that of the dense scene
+    where this is lower.
+
+    A line through the measured differences over the logarithm of the distance crosses zero there, from an eighth of the
+    compared distance to 64 times it.
+
+    Args:
+        errors: of the level.
+        farther: PSNR in dB of the dense scene itself, by multiple of the distance.
+        pixel_size: of the compared views at the median depth, scene units.
+    """
+    measured = {1: errors.near.psnr, **errors.farther}
+    short = [min(psnr, 99.0) - min(ENOUGH, farther.get(times, ENOUGH)) for times, psnr in measured.items()]
+    doublings, gap = torch.tensor([*measured], **DOUBLES).log2(), torch.tensor(short, **DOUBLES)
+    about = doublings - doublings.mean()
+    slope = max(float((about @ gap) / about.square().sum().clamp_min(1e-9)), 1.0)  # dB each time twice as far
+    return pixel_size * 2.0 ** min(max(float(doublings.mean() - gap.mean() / slope), -3.0), 6.0)
 
 
 def far_references(reference: Reference) -> dict[int, Reference]:

@@ -20,7 +20,7 @@ from pointsplat_ns.io.files import replacing, write_json
 def check_folder(folder: Path, names: Iterable[str], force: bool) -> None:
     """Raise a SceneError, before the long computations, if files may not be written to a folder: it is a file or named
     like one, or holds one of these files, which must not be overwritten."""
-    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png") or (folder.exists() and not folder.is_dir()):
+    if folder.suffix.lower() in (".ply", ".sog", ".json", ".png", ".rad") or (folder.exists() and not folder.is_dir()):
         raise SceneError(f"{folder}: levels are several files; expected the name of a folder")
     for name in names:
         if (folder / name).exists() and not force:

@@ -21,11 +21,14 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
+from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth
+from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth, pixel_size_for
 from pointsplat_ns.levels.folder import write_levels
+from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
+from pointsplat_ns.levels.tiles import placed, write_tiles
 from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
@@ -146,6 +149,42 @@ class Levels:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
         return write_stream(folder, self.scenes, self.parents, force, progress, page)
+
+    def save_paged(self, path: str | Path, progress: Progress = silent) -> int:
+        """Write the levels as a RAD file, as ``pointsplat lod -o room.rad`` does; see
+        :func:`~pointsplat_ns.levels.paged.write_paged`. Returns the number of its Gaussians."""
+        return write_paged(path, self.scenes, self.parents, progress)
+
+    def save_tiles(
+        self,
+        folder: str | Path,
+        at: str | None = None,
+        up: str | None = None,
+        force: bool = False,
+        progress: Progress = silent,
+    ) -> list[int]:
+        """Write the levels as 3D Tiles, as ``pointsplat lod --tiles`` does; see
+        :func:`~pointsplat_ns.levels.tiles.write_tiles`. Returns the number of Gaussians of each.
+
+        Args:
+            folder: created if it is missing.
+            at: where the scene lies on the Earth, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; by default the
+                tiles have the frame of the scene's file.
+            up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
+            force, progress: as for :meth:`save_stream`.
+        """
+        about, matrix = placed(self.scenes, self.dense, at, up)
+        return write_tiles(
+            folder, about, [of.cpu() for of in self.parents], self._pixel_sizes(), matrix, force, progress
+        )
+
+    def _pixel_sizes(self) -> list[float]:
+        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
+        Gaussians."""
+        if self.reference is None or self.distance is None:
+            return [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
+        pixel = self.distance / float(self.reference.views.Ks[:, 1, 1].median())
+        return [pixel_size_for(level.errors, self.farther, pixel) for level in self if level.errors is not None]
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""

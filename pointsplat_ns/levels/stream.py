@@ -16,14 +16,14 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
-from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.levels.folder import check_folder
+from pointsplat_ns.levels.tree import Parts, grouped, halved, leaves
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.tensors import FLOATS, INDICES
+from pointsplat_ns.system.tensors import INDICES
 
 
 def write_stream(
@@ -87,36 +87,16 @@ def partition(
     kept = ancestors[0] >= 0
     weights = torch.bincount(ancestors[0][kept], minlength=len(coarsest))
     extent = content_size(coarsest)[1] / 8 if extent is None else extent
+    parts = halved(coarsest.means, weights, most, extent, least)
+    members = leaves(parts)
     leaf_of = torch.empty(len(coarsest), **INDICES)
-    leaves = 0
+    for number, leaf in enumerate(members):
+        leaf_of[leaf] = number
+    groups = (torch.where(of >= 0, leaf_of[of.clamp_min(0)], -1) for of in ancestors)
+    rows = [grouped(scene, group, len(members)) for scene, group in zip(levels, groups, strict=True)]
+    filled = iter(Node(rows=leaf) for leaf in zip(*rows, strict=True))
 
-    def split(members: Tensor) -> tuple | int:  # a leaf's number, or two parts
-        nonlocal leaves
-        points, weight = coarsest.means[members], weights[members]
-        total = int(weight.sum())
-        sides = points.amax(dim=0) - points.amin(dim=0) if len(members) else torch.zeros(3, **FLOATS)
-        too_wide = float(sides.max()) > extent and total > least
-        if len(members) > 1 and (total > most or too_wide):
-            order = points[:, int(sides.argmax())].argsort(stable=True)
-            half = int((weight[order].cumsum(0) < total / 2).sum()) + 1
-            cut = min(max(half, 1), len(members) - 1)
-            return split(members[order[:cut]]), split(members[order[cut:]])
-        leaf_of[members] = leaves
-        leaves += 1
-        return leaves - 1
-
-    parts = split(torch.arange(len(coarsest), **INDICES))
-    rows = []
-    for scene, ancestor in zip(levels, ancestors, strict=True):
-        order = morton_order(scene)
-        order = order[ancestor[order] >= 0]
-        leaf = leaf_of[ancestor[order]]
-        counts = torch.bincount(leaf, minlength=leaves)
-        rows.append(order[leaf.argsort(stable=True)].split(counts.tolist()))
-
-    def node(part: tuple | int) -> Node:
-        if isinstance(part, tuple):
-            return Node(children=(node(part[0]), node(part[1])))
-        return Node(rows=tuple(of_level[part] for of_level in rows))
+    def node(part: Parts) -> Node:
+        return next(filled) if isinstance(part, Tensor) else Node(children=(node(part[0]), node(part[1])))
 
     return node(parts)

@@ -1,7 +1,7 @@
 """glTF with ``KHR_gaussian_splatting``, an extension that Khronos has ratified, as a binary ``.glb``: uncompressed.
 
-Each attribute is an array of its own, sizes and opacities not as logarithms and logits. Written are float32 numbers,
-and colours as bytes for programs that know only points; read are all types that the extension allows.
+Each attribute is an array of its own, sizes and opacities not as logarithms and logits; all types that the extension
+allows are read. :mod:`~pointsplat_ns.io.formats.glb_writing` writes such files.
 """
 
 from __future__ import annotations
@@ -16,41 +16,29 @@ import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import logger, require_file, require_memory
 from pointsplat_ns.io.formats.coding import (
     PACKED,
     Array,
-    bytes_of_logits,
     damage_named,
-    finite_sizes,
     joined,
     load_bytes,
     log_of_sizes,
     scene_of,
-    shares_of_dc,
-    to_bytes,
-    unit_quats,
 )
-from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
+from pointsplat_ns.io.formats.glb_writing import GAUSSIANS
 from pointsplat_ns.io.formats.spz import decode_spz
 from pointsplat_ns.io.offsets import SAMPLED, offset_for
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 
-JSON_BYTES = 8192
-"""The description is filled up with spaces to this size, so that a file's size follows from the number of Gaussians."""
-
-HOLDS = Holds(sizes=FLOAT_SIZES, opacities=Span(0.0, 1.0), antialiased=False, offset=True)
-
-_EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz"
-"""Inside :data:`_EXTENSION`, mostly with a version: ``_2``."""
+"""Inside :data:`GAUSSIANS`, mostly with a version: ``_2``."""
 _OLD_SPZ = "KHR_spz_gaussian_splats_compression"
-"""As CesiumJS drew it in 2025, in place of :data:`_EXTENSION`."""
+"""As CesiumJS drew it in 2025, in place of :data:`GAUSSIANS`."""
 
 
 def read_glb(path: Path | str) -> Gaussians:
@@ -64,7 +52,7 @@ def read_glb(path: Path | str) -> Gaussians:
         meshes: dict[int, Gaussians] = {}
         count = 0
         for index, mesh in enumerate(content.get("meshes", [])):
-            found = [one for one in mesh["primitives"] if {_EXTENSION, _OLD_SPZ} & one.get("extensions", {}).keys()]
+            found = [one for one in mesh["primitives"] if {GAUSSIANS, _OLD_SPZ} & one.get("extensions", {}).keys()]
             if found:
                 parts = []
                 for primitive in found:
@@ -74,7 +62,7 @@ def read_glb(path: Path | str) -> Gaussians:
                         raise SceneError(f"{path}: {count} Gaussians and more; {len(binary)} bytes cannot hold them")
                 meshes[index] = joined(parts)
         if not meshes:
-            raise SceneError(f"{path}: no Gaussians; expected a glTF with {_EXTENSION}")
+            raise SceneError(f"{path}: no Gaussians; expected a glTF with {GAUSSIANS}")
         placed = [(meshes[index], matrix) for index, matrix in _shown(content) if index in meshes]
         if len(placed) > 10_000:
             raise SceneError(f"{path}: {len(placed)} nodes with Gaussians; expected at most 10000")
@@ -178,7 +166,7 @@ def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], memoryview]:
 
 def _primitive(primitive: dict[str, Any], content: dict[str, Any], binary: memoryview, path: Path) -> Gaussians:
     """The Gaussians of one primitive, by the accessors of its attributes."""
-    about = primitive["extensions"].get(_EXTENSION, {})
+    about = primitive["extensions"].get(GAUSSIANS, {})
     inner = about.get("extensions", {})
     packed = primitive["extensions"].get(_OLD_SPZ) or next(
         (value for name, value in inner.items() if name.startswith(_SPZ)), None
@@ -188,28 +176,28 @@ def _primitive(primitive: dict[str, Any], content: dict[str, Any], binary: memor
     attributes, others = primitive["attributes"], [*inner]
     if others or about.get("kernel", "ellipse") != "ellipse":
         wanted = ", ".join([*others, f"the kernel {about.get('kernel')}"])
-        raise SceneError(f"{path}: its Gaussians need {wanted}; expected {_EXTENSION} alone, of ellipses")
+        raise SceneError(f"{path}: its Gaussians need {wanted}; expected {GAUSSIANS} alone, of ellipses")
     if about.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
         logger.warning("%s: colours of the space %s are read as sRGB", path, about["colorSpace"])
 
     def values(name: str, columns: int) -> Array:
         return _numbers(attributes[name], columns, content, binary, path)
 
-    degree = max(d for d in range(MAX_SH_DEGREE + 1) if d == 0 or f"{_EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
+    degree = max(d for d in range(MAX_SH_DEGREE + 1) if d == 0 or f"{GAUSSIANS}:SH_DEGREE_{d}_COEF_0" in attributes)
     means = values("POSITION", 3)
     require_memory(path, 8 * len(means) * (11 + 3 * (degree + 1) ** 2))
-    alphas = values(f"{_EXTENSION}:OPACITY", 1).clip(0, 1)
+    alphas = values(f"{GAUSSIANS}:OPACITY", 1).clip(0, 1)
     with np.errstate(divide="ignore"):
         logits = np.log(alphas) - np.log1p(-alphas)
     coefficients = [
-        values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{index}", 3) for d in range(degree + 1) for index in range(2 * d + 1)
+        values(f"{GAUSSIANS}:SH_DEGREE_{d}_COEF_{index}", 3) for d in range(degree + 1) for index in range(2 * d + 1)
     ]
     if {len(array) for array in coefficients} != {len(means)}:
         raise ValueError("attributes of different lengths")
     return scene_of(
         means,
-        log_of_sizes(values(f"{_EXTENSION}:SCALE", 3)),
-        values(f"{_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        log_of_sizes(values(f"{GAUSSIANS}:SCALE", 3)),
+        values(f"{GAUSSIANS}:ROTATION", 4)[:, [3, 0, 1, 2]],
         logits,
         coefficients[0],
         np.stack(coefficients[1:], axis=1) if degree else np.empty((len(means), 0, 3)),
@@ -260,76 +248,3 @@ def _entry(entries: Any, index: Any) -> dict[str, Any]:
     if not isinstance(index, int) or not 0 <= index < len(entries):
         raise ValueError(f"entry {index!r} of {len(entries)}")
     return entries[index]
-
-
-def glb_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
-    """Size of a ``.glb`` of ``count`` Gaussians, bytes."""
-    floats = 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
-    return 12 + 8 + JSON_BYTES + 8 + (4 * floats + 4) * count
-
-
-def encode_glb(scene: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a ``.glb`` with one mesh of points, of a scene, float32 on the CPU. The axes stay those of the
-    scene; glTF's own have y up. ``progress`` is not called."""
-    arrays = _attributes(scene)
-    as_float, as_byte, array_buffer, points = 5126, 5121, 34962, 0  # glTF's numbers
-    views: list[dict[str, object]] = []
-    accessors: list[dict[str, object]] = []
-    offset = 0
-    for name, array in arrays.items():
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": array_buffer})
-        accessor = {
-            "bufferView": len(accessors),
-            "componentType": as_byte if array.dtype == np.uint8 else as_float,
-            "count": len(array),
-            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]],
-        }
-        if array.dtype == np.uint8:
-            accessor["normalized"] = True
-        if name == "POSITION" and len(array):
-            accessor.update(min=array.min(axis=0).tolist(), max=array.max(axis=0).tolist())
-        accessors.append(accessor)
-        offset += array.nbytes
-    ellipse = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "sortingMethod": "cameraDistance",
-        "projection": "perspective",
-    }
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(arrays)},
-        "mode": points,
-        "extensions": {_EXTENSION: ellipse},
-    }
-    content = {
-        "asset": {"version": "2.0", "generator": "pointsplat-ns"},
-        "extensionsUsed": [_EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} if scene.offset is None else {"mesh": 0, "translation": list(scene.offset)}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
-    }
-    text = json.dumps(content, separators=(",", ":")).encode().ljust(JSON_BYTES)
-    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + offset)
-    parts = [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", offset, b"BIN\0")]
-    return b"".join([*parts, *(array.tobytes() for array in arrays.values())])
-
-
-def _attributes(scene: Gaussians) -> dict[str, Array]:
-    """The arrays of the file by their attribute's name, each (N, 1), (N, 3) or (N, 4)."""
-    rgba = np.column_stack([to_bytes(255 * shares_of_dc(scene)), bytes_of_logits(scene)])
-    arrays: dict[str, Array] = {"POSITION": scene.means.numpy(), "COLOR_0": rgba}
-    of_splats: dict[str, Array] = {
-        "ROTATION": unit_quats(scene)[:, [1, 2, 3, 0]],
-        "SCALE": finite_sizes(scene),
-        "OPACITY": scene.alphas[:, None].numpy(),
-    }
-    coefficients = scene.sh.numpy()
-    for degree in range(scene.sh_degree + 1):
-        for index in range(2 * degree + 1):
-            of_splats[f"SH_DEGREE_{degree}_COEF_{index}"] = coefficients[:, degree**2 + index]
-    arrays.update({f"{_EXTENSION}:{name}": array.astype("<f4") for name, array in of_splats.items()})
-    return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
