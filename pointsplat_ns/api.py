@@ -152,8 +152,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    _, pruned, _, _ = prune_source(scene, request, Looking(views, resolution, up, data), progress)
-    return pruned
+    return prune_source(scene, request, Looking(views, resolution, up, data), progress)[1]
 
 
 def compact(
@@ -228,8 +227,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
     looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
-    _, result, _ = compact_source(scene, request, targets, looking, progress)
-    return result
+    return compact_source(scene, request, targets, looking, progress)[1]
 
 
 @normal_mode
@@ -302,6 +300,7 @@ def lod(
         made = make_levels(dense, levels, sh, view_source, source, report)
         if folder is not None and stream:
             made.save_stream(folder, force, report, page)
+            made = made.of_stream(folder, page)
         elif folder is not None:
             made.save(folder, force)
     log((*made.notes, *([page.note] if page else [])))

@@ -91,7 +91,7 @@ def _print_table(found: Tradeoff) -> None:
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")
-    print(f"{found.scene}: {count}, {found.width} x {found.height} pixels, {found.views_origin}")
+    print(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
     print(found.machine)
     rows = []
     for point in found.points:
@@ -104,14 +104,15 @@ def _print_table(found: Tradeoff) -> None:
                 f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
                 three_digits(point.frame_ms),
                 "-" if point.fill is None else f"{point.fill:.1f}",
-                psnr_text(point.against_dense.psnr, 2),
-                *([psnr_text(point.against_photos.psnr if point.against_photos else None, 2)] if photos else []),
+                *([psnr_text(point.against_photos.psnr if point.against_photos else None)] if photos else []),
+                psnr_text(point.against_dense.psnr),
+                f"{point.against_dense.ssim:.2f}",
             )
         )
-    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill", "dB,\nrenders"]
+    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill"]
     print_table(
-        (*columns, *(["dB,\nphotos"] if photos else [])),
+        (*columns, *(["dB,\nphotos"] if photos else []), "dB,\ndense", "SSIM"),
         rows,
         "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
-        "drawn per pixel; dB of PSNR",
+        "drawn per pixel; dB of PSNR, and SSIM, against the dense scene",
     )

@@ -18,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
-from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
@@ -148,27 +148,22 @@ def _for_psnr(
     """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
     scene has the PSNR when it is rounded; and a line on the search. ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
+    from pointsplat_ns.compression.quality import Judge, decibels, through_file
 
     assert isinstance(budget, WithinPsnr)
-    compared, kind = views.compared(), format_to_write(budget.suffix)
+    judge, kind = Judge(dense, views), format_to_write(budget.suffix)
     limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
-    whole: dict[int, Gaussians] = {}  # by count, where the scenes that are compared are rounded
 
-    def made(count: int) -> Gaussians:
-        scene = make(count)
-        if limit is None:
-            return scene
-        whole[count] = scene
-        return limit.rounded(scene)
+    def psnr_of(scene: Gaussians, progress: Callable[[float], None]) -> tuple[float, float]:
+        rounded = scene if limit is None else limit.rounded(scene)
+        return judge.psnr(through_file(rounded, budget.suffix)[1], progress)
 
-    reached = smallest_within(dense, made, compared, budget.value, progress)
+    reached = smallest_within(len(dense), make, psnr_of, budget.value, progress)
     note = (
-        f"{counted(len(reached.tried), 'size')} tried: no difference from the dense scene"
-        if reached.psnr == math.inf
-        else f"{counted(len(reached.tried), 'size')} tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
-        f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
+        f"{counted(len(reached.tried), 'size')} tried: {decibels(reached.psnr)} against the dense scene, "
+        f"{decibels(reached.worst)} in the worst of {views_text(len(judge.views))}"
     )
-    return whole.get(reached.count, reached.scene), limit, note
+    return reached.scene, limit, note
 
 
 def _for_size(

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.metrics import SSIM_WINDOW, psnr_of, ssim
+from pointsplat_ns.metrics import SSIM_WINDOW, psnr_of
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render_with_alpha
 from pointsplat_ns.views import Views
 
@@ -97,7 +98,8 @@ class Reference:
         for image, target in zip(images, self.renders, strict=True):
             errors.append(float((image.double() - target.double()).square().mean()))
             if min(height, width) >= SSIM_WINDOW:
-                similarities.append(float(ssim(image, target.to(image))))
+                planes, others = image.permute(2, 0, 1)[None], target.to(image).permute(2, 0, 1)[None]
+                similarities.append(float(mean_ssim(planes, others)))
             if progress is not None:
                 progress(len(errors) / len(self.renders))
         similarity = sum(similarities) / len(similarities) if similarities else None
