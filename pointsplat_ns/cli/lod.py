@@ -78,6 +78,7 @@ def lod(
 
 
 def _print_table(made: Levels, folder: Path) -> None:
+    from pointsplat_ns.compression.quality import word_for
     from pointsplat_ns.io.files import bytes_text, three_digits
     from pointsplat_ns.io.formats import STREAM_META
     from pointsplat_ns.pruning import ply_bytes
@@ -95,7 +96,7 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"{level.seconds:.1f}",
                 psnr_text(near.psnr if near else None),
                 f"{near.ssim:.2f}" if near and near.ssim is not None else "-",
-                near.word if near else "-",
+                word_for(near.psnr) if near else "-",
             )
         )
     size = bytes_text(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))

@@ -58,6 +58,7 @@ def tradeoff(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
+    from pointsplat_ns.compression.quality import quality_line
     from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.points import RESULTS
     from pointsplat_ns.tradeoff.recommend import next_best
@@ -79,6 +80,8 @@ def tradeoff(
     print(found.why)
     best = found.point(found.recommended)
     best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
+    if best is not found.points[0]:
+        print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
         print(f"$ {best.command}")
     print(f"{folder}: table and pictures; open {folder / RESULTS['page']}")

@@ -116,8 +116,8 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column. Raises
-    SceneError if the file cannot be written."""
+    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column, also in the
+    file's description. Raises SceneError if the file cannot be written."""
     from matplotlib.figure import Figure
 
     height, width = np.shape(rows[0][0])[:2]
@@ -132,7 +132,7 @@ def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: P
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=11)
     with replacing(path) as part:
-        figure.savefig(part, dpi=100, format="png")
+        figure.savefig(part, dpi=100, format="png", metadata={"Description": "\n".join(titles)})
 
 
 def size_quantiles(scene: Gaussians) -> list[float]:

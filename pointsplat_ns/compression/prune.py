@@ -116,9 +116,9 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -
         degree = int(sh)
     if degree >= dense.sh_degree:
         return dense, f"SH degree {dense.sh_degree} kept"
-    lost = 100 * energy_lost(dense, degree)
+    lost = energy_lost(dense, degree)
     cut = f"SH degree {dense.sh_degree} cut to {degree}"
-    return cut_sh(dense, degree), f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}"
+    return cut_sh(dense, degree), f"{cut}: colours change {lost:.0%} less with the view{reached}"
 
 
 def _selector(

@@ -106,10 +106,12 @@ class Quality:
     """What photos say, if the scene was trained on some."""
 
     def __str__(self) -> str:
-        figures = decibels(self.psnr) + ("" if self.ssim is None else f", SSIM {self.ssim:.2f}")
-        if self.photos is None or not self.photos.kept:
-            return "; ".join([f"{figures}: {self.word}", *([] if self.photos is None else [str(self.photos)])])
-        return f"{self.photos}; against the dense scene, no longer the aim, {figures}"
+        line = quality_line(self.psnr, self.ssim)
+        if self.photos is None:
+            return line
+        if not self.photos.kept:
+            return f"{line}; {self.photos}"
+        return f"{self.photos}; against the dense scene, no longer the aim, {line.partition(': ')[0]}"
 
     @property
     def details(self) -> str:
@@ -117,11 +119,6 @@ class Quality:
         views = f"{views_text(self.views)} of {self.width} x {self.height} pixels"
         fills = f"{self.fill_before:.1f} -> {self.fill:.1f} Gaussians drawn per pixel"
         return f"in {views} ({self.origin}), {decibels(self.worst)} in the worst; fill: {fills}"
-
-    @property
-    def word(self) -> str:
-        """What a PSNR like this looks like."""
-        return next((word for least, word in WORDS if self.psnr >= least), WORDS[-1][1])
 
     def as_dict(self) -> dict[str, Any]:
         """The figures and the text, for JSON."""
@@ -131,6 +128,16 @@ class Quality:
 def decibels(psnr: float) -> str:
     """A PSNR as text."""
     return f"more than {MOST_SAID:g} dB" if psnr > MOST_SAID else f"{psnr:.1f} dB"
+
+
+def word_for(psnr: float) -> str:
+    """What a PSNR against the dense scene, dB, looks like."""
+    return next((word for least, word in WORDS if psnr >= least), WORDS[-1][1])
+
+
+def quality_line(psnr: float, ssim: float | None) -> str:
+    """The line that users read of a PSNR, dB, and SSIM against the dense scene."""
+    return decibels(psnr) + ("" if ssim is None else f", SSIM {ssim:.2f}") + f": {word_for(psnr)}"
 
 
 class Judge:

@@ -128,7 +128,7 @@ class Measurer:
             lpips(image, image)
             return lpips
         except LpipsUnavailable:  # its text names folders, which the page must not show
-            self.note("LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS")
+            self.note("LPIPS is missing: its weights are not at hand; POINTSPLAT_LPIPS_WEIGHTS names their folder")
         except ImageError as error:  # an image too small for the network
             self.note(f"LPIPS is missing: {error}")
         return None
@@ -183,9 +183,11 @@ class Measurer:
     def _compared(self, scene: Gaussians, progress: Callable[[float], None]) -> dict[str, Any]:
         """The figures of a point that are seen in its renders."""
         (views, photos, _), images, against_photos, quality = self.judged_views, [], None, self.judge.quality(scene)
-        for view in views if self.lpips is not None or photos is not None else ():
+        drawn = views if self.lpips is not None or photos is not None else views[:0]
+        progress(1 / (1 + len(drawn)))
+        for view in drawn:
             images.append(render(scene, view))
-            progress(len(images) / len(views))
+            progress((1 + len(images)) / (1 + len(drawn)))
         if photos is not None:
             pairs = [(image, photo.to(image)) for image, photo in zip(images, photos, strict=True)]
             psnr, similarity = (fmean(float(metric(*pair)) for pair in pairs) for metric in (finite_psnr, ssim))

@@ -140,8 +140,6 @@ class Tradeoff:
     width: int
     height: int
     """Size of the pictures, in pixels."""
-    judged_in: str
-    """Number and size of the views that scenes are judged in, as text."""
     points: tuple[Point, ...]
     notes: tuple[str, ...] = ()
     """Lines of text for the reader, such as on a busy machine or missing LPIPS."""
@@ -155,6 +153,8 @@ class Tradeoff:
     """Text on the reason for it, and its cost."""
     target: str = ""
     """Text on the targets that were searched for, such as "at least 32 dB"; empty for a table."""
+    judged_in: str = ""
+    """Number and size of the views that scenes are judged in, as text."""
 
     def point(self, key: str) -> Point:
         """The point with a key. Raises KeyError if there is no such point."""

@@ -83,7 +83,7 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
 
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
 def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
-    run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply")
+    run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply", "--verbose")
     dense, views = read_scene(splatfacto_run), dataset_views(splatfacto_run)
     wanted = select(METHODS[by].score(dense, views), len(read_ply(tmp_path / "out.ply")))
     assert same(read_ply(tmp_path / "out.ply"), dense[wanted])
@@ -96,7 +96,9 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
     said = capsys.readouterr().out
     assert sorted(tmp_path.iterdir()) == before
     assert "dry run, nothing is written: pruned by coverage to 20 of 80 Gaussians (25 %)" in said
-    assert "SH degree 3 cut to 0: 100 % of what SH add to colours is lost" in said and "quantiles" not in said
+    assert "quantiles" not in said and "SH degree" not in said
+    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run", "--verbose")
+    assert "SH degree 3 cut to 0: colours change 100% less with the view" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
