@@ -46,8 +46,6 @@ class Pruned:
     scene: Gaussians
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
-    views: Views | None = None
-    """The views that merging rendered; None if it rendered none, or for another method."""
     limit: FileLimit | None = None
     """The limit of a compressed file, and the rounding that meets it; None for another budget."""
 
@@ -66,7 +64,7 @@ def prune_scene(
     views = views or ViewSource(dense)
     full, about_sh = _with_sh(dense, request.sh, views, progress)
     count = request.count_of(len(full), full.sh_degree, full.traits)
-    start, cleaning, limit, seen, searched = full, None, None, None, ""
+    start, cleaning, limit, searched = full, None, None, ""
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene
 
@@ -78,7 +76,7 @@ def prune_scene(
     if count is not None and merging:
         merged = merge(start, count, report, views.for_merging())
         logger.debug("%s", merged.finish.note)
-        scene, seen = merged.scene, merged.views
+        scene = merged.scene
     elif count is not None:
         scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
     else:
@@ -91,13 +89,12 @@ def prune_scene(
             scene, limit, searched = _for_size(dense, start, make, request.budget, views, searching)
         else:
             scene, limit, searched = _for_psnr(dense, make, request.budget, views, searching)
-        seen = None if merger is None else merger.views
     if limit is not None and rounding:
         scene = limit.rounded(scene)
     about_views = views.text if views.origin else ""
     about_junk = () if cleaning is None else cleaning.notes
     notes = tuple(note for note in (about_views, about_sh, *about_junk, searched) if note)
-    return Pruned(scene, notes, seen, limit)
+    return Pruned(scene, notes, limit)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, str]:

@@ -184,10 +184,8 @@ class Judge:
         """The judgement of a scene."""
         (psnr, worst), similarity = self.psnr(scene), None
         if self._bands is not None:
-            close = self._bands.closeness(self._placed(scene))
-            assert close.ssim is not None
-            covered = sum(close.covered) / len(close.covered)
-            similarity = 1 - (1 - close.ssim) / (covered or 1.0)
+            covered = sum(self._bands.covered) / len(self._bands.covered)
+            similarity = 1 - (1 - self._bands.ssim(self._placed(scene))) / (covered or 1.0)
         views = (len(self.views), self.views.width, self.views.height, self.origin)
         return Quality(psnr, worst, similarity, *views, self._fill, fill(scene, self.views))
 
