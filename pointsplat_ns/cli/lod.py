@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
@@ -100,6 +101,6 @@ def _print_table(made: Levels, folder: Path) -> None:
             )
         )
     size = bytes_text(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
-    print(f"{folder}: {len(made)} levels of {len(made.dense):,} Gaussians, {size} in all")
+    print(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

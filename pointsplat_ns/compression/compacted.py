@@ -18,7 +18,7 @@ from pointsplat_ns.views import Views
 class Stage:
     """One stage of compaction: its scene and its figures."""
 
-    name: Literal["prune", "refine", "repair", "photos", "round"]
+    name: Literal["merge", "prune", "refine", "repair", "photos", "round"]
     scene: Gaussians
     """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
     after: Closeness | None

@@ -65,6 +65,7 @@ def plot_comparison(
     for stage in result.stages:
         if stage.after is not None:
             name = {
+                "merge": "merged",
                 "prune": "pruned",
                 "refine": "refined",
                 "repair": "repaired",

@@ -76,8 +76,9 @@ class PhotoGain:
     """Whether the scene after it was kept."""
 
     def __str__(self) -> str:
-        gain = f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} photos"
-        return gain if self.kept else f"training on photos does not help ({gain}) and is left out"
+        if self.kept:
+            return f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} photos"
+        return f"{self.before:.1f} dB in {self.photos} photos, which training on them does not raise"
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Quality:
         if self.photos is None:
             return line
         if not self.photos.kept:
-            return f"{line}; {self.photos}"
+            return f"{self.photos}; {line}"
         return f"{self.photos}; against the dense scene, no longer the aim, {line.partition(': ')[0]}"
 
     @property

@@ -324,7 +324,7 @@ def find_scene(
     if timed:
         measurer.note(busy_note([point.others_cores for point in search.tried.values()]))
     made = measurer.made(found.setting, progress)
-    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
+    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes, by)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
     seconds = time.perf_counter() - start
     return replace(compacted, target=found.why, interrupted=interrupted, notes=notes, seconds=seconds)
