@@ -196,9 +196,8 @@ def compact(
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
             or for ``seconds``. Photos in and outside of the steps say whether the result is better.
-        target_db: least PSNR against the given scene's renders, over the pixels that it covers, dB; in the views of
-            held-out photos if the run has any.
-        target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
+        target_db: least PSNR of the file against the given scene's renders, over the pixels that it covers, dB.
+        target_ms: longest time of a frame, milliseconds, drawn by this package.
         target_mb: largest file, in units of 10^6 bytes.
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if

@@ -118,7 +118,7 @@ def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(hel
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(acceptance, "DenseReference", Watched)
-        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply")
+        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply", "--verbose")
     assert "poses of the dataset" in capsys.readouterr().out
     assert seen == [("antialiased", [1.0, 1.0, 1.0], 64)]
     assert len(read_ply(tmp_path / "small.ply")) == round(len(read_scene(source)) / 2 + 0.1)
