@@ -154,8 +154,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    _, pruned, _, _ = prune_source(scene, request, Looking(views, resolution, up, data), progress)
-    return pruned
+    return prune_source(scene, request, Looking(views, resolution, up, data), progress)[1]
 
 
 def compact(
@@ -200,9 +199,8 @@ def compact(
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
             or for ``seconds``. Photos in and outside of the steps say whether the result is better.
-        target_db: least PSNR against the given scene's renders, over the pixels that it covers, dB; in the views of
-            held-out photos if the run has any.
-        target_ms: longest time of a frame, milliseconds, drawn by this package in these views.
+        target_db: least PSNR of the file against the given scene's renders, over the pixels that it covers, dB.
+        target_ms: longest time of a frame, milliseconds, drawn by this package.
         target_mb: largest file, in units of 10^6 bytes.
         target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
@@ -231,8 +229,7 @@ def compact(
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
     looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
-    _, result, _ = compact_source(scene, request, targets, looking, progress)
-    return result
+    return compact_source(scene, request, targets, looking, progress)[1]
 
 
 @normal_mode
@@ -316,6 +313,7 @@ def lod(
         made = make_levels(dense, levels, sh, view_source, source, report)
         if folder is not None and stream:
             made.save_stream(folder, force, report, page)
+            made = made.of_stream(folder, page)
         elif folder is not None and paged:
             made.save_paged(folder, report)
         elif folder is not None and tiles:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
     from pointsplat_ns.compression.posed_photos import PosedPhotos
-    from pointsplat_ns.compression.quality import FullSizeQuality
     from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.search import Targets
 
@@ -66,26 +63,22 @@ class Looking:
 
 @normal_mode
 def prune_source(
-    scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False, compared: str = ""
-) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
-    """Read a scene and prune it; notes are logged.
+    scene: Source, request: PruneRequest, looking: Looking, progress: bool | Progress = False
+) -> tuple[Gaussians, Gaussians, float, ViewSource]:
+    """Read a scene and prune it; notes are logged as details.
 
     Returns:
-        The dense scene, the smaller scene, the seconds of pruning, and how close both are, if ``compared`` is the
-        suffix of the file to be written; None if there are no views.
+        The dense scene, the smaller scene, the seconds of pruning, and the source of its views, to judge it in.
     """
     from pointsplat_ns.compression.prune import prune_scene
-    from pointsplat_ns.compression.quality import quality_of_pruned
 
     dense, source = read_source(scene, looking)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
-        seconds, quality = time.perf_counter() - start, None
-        if compared:
-            quality = _as_written(lambda scene: quality_of_pruned(dense, scene, pruned, source), pruned.scene, compared)
-    log(pruned.notes)
-    return dense, pruned.scene, seconds, quality
+        seconds = time.perf_counter() - start
+    _log_details(pruned.notes, source)
+    return dense, pruned.scene, seconds, source
 
 
 @normal_mode
@@ -95,17 +88,13 @@ def compact_source(
     targets: Targets | None,
     looking: Looking,
     progress: bool | Progress = False,
-    compared: str = "",
-) -> tuple[Gaussians, Compacted, FullSizeQuality | None]:
-    """Read a scene and compact it, or search for targets; verdicts and notes are logged. A search uses only method,
-    refiner, effort and format of the request, and decides the rest.
+) -> tuple[Gaussians, Compacted, ViewSource]:
+    """Read a scene and compact it, or search for targets; verdicts and notes are logged as details. A search uses only
+    method, refiner, effort and format of the request, and decides the rest.
 
     Returns:
-        The dense scene, the result, and how close both are at full size, in the views that no repair uses, if
-        ``compared`` is the suffix of the file to be written; None if there are no views.
+        The dense scene, the result, and the source of its views, to judge it in.
     """
-    from pointsplat_ns.compression.quality import quality_if_seen
-
     posed = None
     if looking.photos is not None:
         dense, source, posed = _read_with_photos(scene, looking, looking.photos, progress)
@@ -127,28 +116,13 @@ def compact_source(
             run, size, upward, data = looking.run_of(scene), looking.size, looking.upward, looking.data
             subject = subject_of(dense, run, source.given, request.refiner, request.prune.suffix, size, upward, data)
             result = find_scene(subject, targets, request.prune.by, repairs_of(request.repair.effort), report)
-        quality = None
-        if compared:
-            quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), result.scene, compared)
-    log((*result.notes, *result.verdict.splitlines(), *result.target.splitlines()))
+    _log_details((*result.notes, *result.verdict.splitlines()), source)
+    log(tuple(result.target.splitlines()))
     if posed is not None and posed.held_out:
         from pointsplat_ns.compression.posed_photos import held_out_text
 
         log((held_out_text(dense.to(request.device), result, posed.held_out),))
-    return dense, result, quality
-
-
-def _as_written(
-    quality_of: Callable[[Gaussians], FullSizeQuality | None], scene: Gaussians, suffix: str
-) -> FullSizeQuality | None:
-    """Quality of a scene; where it does not differ from the dense scene, that of its file, which may round numbers."""
-    from pointsplat_ns.tradeoff.making import through_file
-
-    quality = quality_of(scene)
-    if quality is not None and quality.psnr == math.inf:
-        written = through_file(scene, suffix)[1]
-        quality = quality if written is scene else quality_of(written)
-    return quality
+    return dense, result, source
 
 
 def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]:
@@ -212,3 +186,9 @@ def log(lines: tuple[str, ...]) -> None:
     """Log lines of text at level INFO."""
     for line in lines:
         logger.info("%s", line)
+
+
+def _log_details(lines: tuple[str, ...], source: ViewSource) -> None:
+    """Log lines of text at level DEBUG, but at level INFO that the poses of a run are not found."""
+    for line in lines:
+        logger.log(logging.INFO if source.missing and line == source.text else logging.DEBUG, "%s", line)

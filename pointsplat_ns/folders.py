@@ -10,7 +10,7 @@ from typing import Literal
 
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.quality import quality_of_pruned
+from pointsplat_ns.compression.quality import judge_of
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import SceneError
@@ -198,14 +198,12 @@ class _Pruning:
             note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
             kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
             return SmallerScene(kept, None, note, same)
-        scene, psnr = self.smaller(dense, request, source)
-        return SmallerScene(scene, psnr, source.missing[2:-1])
+        scene = self.smaller(dense, request, source)
+        return SmallerScene(scene, judge_of(dense, source), source.missing[2:-1])
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> tuple[Gaussians, float | None]:
-        """The smaller scene, and its PSNR against renders of the dense one, dB."""
-        pruned = prune_scene(dense, request, source)
-        quality = quality_of_pruned(dense, pruned.scene, pruned, source)
-        return pruned.scene, None if quality is None else quality.psnr
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> Gaussians:
+        """The smaller scene."""
+        return prune_scene(dense, request, source).scene
 
 
 @dataclass(frozen=True)
@@ -216,12 +214,12 @@ class _Compacting(_Pruning):
     """Loaded by each process."""
     repair: RepairBudget
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> tuple[Gaussians, float | None]:
-        """The compact scene, and its PSNR against renders of the dense one, dB."""
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> Gaussians:
+        """The compact scene."""
         result = compact_scene(dense, CompactRequest(request, _loaded(self.refiner), self.repair), source)
         if result.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
-        return result.scene, result.psnr
+        return result.scene
 
 
 def _converted(
@@ -254,4 +252,4 @@ def _found(
     result = find_scene(subject, targets, by, repairs, silent)
     if result.interrupted:
         raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene
-    return SmallerScene(result.scene, result.psnr)
+    return SmallerScene(result.scene, judge_of(dense, subject.new_views()))

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pointsplat_ns.compression.quality import Judge, read_back
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
@@ -91,8 +92,8 @@ class SmallerScene:
     """A smaller scene, and figures for the table."""
 
     scene: Gaussians
-    psnr: float | None = None
-    """PSNR against the dense scene's renders, dB; None if nothing was compared."""
+    judge: Judge | None = None
+    """Judges the written file; None if nothing is compared."""
     note: str = ""
     """A remark for the table."""
     same: bool = False
@@ -294,12 +295,13 @@ def _write(task: SceneTask, before: int, made: SmallerScene, proofs: Mapping[str
             shutil.copyfile(task.source, part)
         else:
             save_as(kind, made.scene, part, name=task.output)
+        psnr = math.inf if made.judge is None else made.judge.psnr(read_back(made.scene, part, kind))[0]
         done = task.result(
             "done",
             before=before,
             after=len(made.scene),
             megabytes=part.stat().st_size / 1e6,
-            psnr=made.psnr if math.isfinite(made.psnr or 0.0) else None,
+            psnr=psnr if math.isfinite(psnr) else None,
             seconds=time.perf_counter() - start,
             note=made.note,
         )

@@ -122,7 +122,7 @@ def info(
     good = scene[usable]
     source = ViewSource(good, resolution=size, up=known)
     try:
-        views = source.views(6)  # few, as info has to be fast
+        views = source.whole()
         up_found: Up | None = source.up
         filled, views_text = fill(good, views), f"{len(views)} views of {views.width} x {views.height} pixels"
     except DataError:  # nothing is visible

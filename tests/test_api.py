@@ -108,7 +108,7 @@ def ply(scene, tmp_path_factory) -> Path:
 
 def test_views_may_be_given(scene, caplog):
     views = ps.sample_views(scene, 3, 48, 36)
-    with caplog.at_level(logging.INFO, "pointsplat_ns"):
+    with caplog.at_level(logging.DEBUG, "pointsplat_ns"):
         small = ps.prune(scene, "auto:22", "coverage", views=views)
     pictures = [(ps.render(small, view), ps.render(scene, view)) for view in views]
     error = torch.stack([(a.double() - b.double()).square().mean() for a, b in pictures]).mean()
@@ -119,7 +119,7 @@ def test_views_may_be_given(scene, caplog):
 
 def test_views_may_be_those_of_a_run(scene, trained_walls, caplog):
     (run,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    with caplog.at_level(logging.INFO, "pointsplat_ns"):
+    with caplog.at_level(logging.DEBUG, "pointsplat_ns"):
         small = ps.prune(scene, "10%", "lightgaussian", views=run)
     assert "poses of the dataset" in caplog.text
     assert same(small, ps.prune(scene, "10%", "lightgaussian", views=ps.dataset_views(run)))

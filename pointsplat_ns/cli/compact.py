@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +13,7 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
     end_if_interrupted,
-    print_distributions,
+    print_details,
     print_json,
     print_result,
     scene_result,
@@ -22,7 +22,7 @@ from pointsplat_ns.cli.printing import (
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
-    from pointsplat_ns.compression.quality import FullSizeQuality
+    from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -133,6 +133,7 @@ def compact(
         )  # fmt: skip
     options.need_no_folder_options(scene, jobs, shard)
     from pointsplat_ns.compacting import Looking, compact_source
+    from pointsplat_ns.compression.quality import quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
@@ -151,23 +152,22 @@ def compact(
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
     looking = Looking(poses, resolution, up, data, photos if isinstance(photos, Path) else None)
     with fixed_threads(threads):
-        dense, result, quality = compact_source(
-            scene, request, targets, looking, progress=True, compared=kind.budget_suffix
-        )
+        dense, result, source = compact_source(scene, request, targets, looking, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
     with options.scene_written(written):
+        quality = quality_of_file(dense, source, result.scene, written, kind.budget_suffix)
+        if quality is not None:
+            quality = replace(quality, photos=result.photo_gain)
         files = [_file_text(scene), "not written" if written is None else _file_text(written)]
-        shown = None if picture is None else ps.plot_comparison(dense, result, picture, files)
+        shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
         if html is not None:
             _write_page(scene, dense, result, files, html, html_limit, up, quality)
     if json_output:
         made = {
             "refined": result.accepted,
             "repaired": result.repair_accepted,
-            "photo_psnr": result.photo_psnr,
-            "psnr": result.psnr,
-            "quality": None if quality is None else asdict(quality),
+            **(quality.as_dict() if quality else {"psnr": None}),
             "picture": picture,
             "html": html,
         }
@@ -177,7 +177,7 @@ def compact(
     also += ["trained on photos"] * (result.last.photos is not None)
     print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
     if verbose:
-        print_distributions(dense, result.scene)
+        print_details(quality, dense, result.scene)
     if shown is not None:
         print(shown)
     if html is not None:
@@ -202,14 +202,14 @@ def _write_page(
     html: Path,
     limit_mb: float,
     up: str | None,
-    quality: FullSizeQuality | None,
+    quality: Quality | None,
 ) -> None:
     """The page to fly through the scene before and after."""
     import pointsplat_ns as ps
     from pointsplat_ns.io.runs import name_of
 
     names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)]
-    notes = [] if quality is None else [f"{quality}".splitlines()[0]]
+    notes = [] if quality is None else [f"{quality}"]
     sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
     ps.write_page(
         [dense, result.scene], html, names, title=name_of(scene), notes=notes,

@@ -58,7 +58,7 @@ def demo(output: Path = Path("outputs/demo"), scene_only: bool = False, force: b
     need("nerfstudio", "the rest of the demo, which trains,")
     rows += train_and_judge(output)
     show_results(rows)
-    print("So few steps show the commands. A refiner that gains takes hours: docs/guides/own_refiner.md.")
+    print("So few steps show the commands. A refiner that gains takes hours.")
     print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes; everything is in {output}")
 
 

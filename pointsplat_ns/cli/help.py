@@ -80,5 +80,5 @@ def after_help(args: list[str]) -> str:
         return "\n".join(["examples:", *lines])
     table = [f"  {status:<5}{meaning}" for status, meaning in STATUSES.items()]
     examples = "`pointsplat COMMAND --help` has examples."
-    completion = "Completion of commands and options in your shell: docs/command_line.md."
+    completion = "Completion in your shell: `pointsplat --tyro-write-completion bash FILE`; zsh and tcsh as well."
     return "\n".join(["exit status:", *table, "", examples, completion])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
+from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.terminal import print_table
 
 if TYPE_CHECKING:
@@ -86,9 +87,12 @@ def lod(
 
 
 def _print_table(made: Levels, folder: Path) -> None:
-    from pointsplat_ns.io.files import three_digits
+    from pointsplat_ns.compression.quality import word_for
+    from pointsplat_ns.io.files import bytes_text, three_digits
+    from pointsplat_ns.io.formats import STREAM_META
     from pointsplat_ns.pruning import ply_bytes
 
+    stream = (folder / STREAM_META).exists()
     rows = []
     for index, level in enumerate(made):
         near = level.errors and level.errors.near
@@ -97,13 +101,14 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"level_{index}",
                 f"{len(level.scene):,}",
                 f"{100 * len(level.scene) / len(made.dense):.3g} %",
-                three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
-                psnr_text(near.psnr if near else None),
-                psnr_text(near.worst if near else None),
-                f"{near.ssim:.3f}" if near and near.ssim is not None else "-",
+                "-" if stream else three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
                 f"{level.seconds:.1f}",
+                psnr_text(near.psnr if near else None),
+                f"{near.ssim:.2f}" if near and near.ssim is not None else "-",
+                word_for(near.psnr) if near else "-",
             )
         )
-    print(f"{folder}: {len(made)} levels of {len(made.dense):,} Gaussians")
-    header = ("", "Gaussians", "share", "MB", "PSNR, dB", "worst, dB", "SSIM", "seconds")
-    print_table(header, rows, "against the dense scene's own renders; worst: of the views")
+    size = bytes_text(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
+    print(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
+    header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
+    print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

@@ -14,7 +14,7 @@ from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.quality import FullSizeQuality
+    from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.ply import PlyRows
 
@@ -71,10 +71,10 @@ def print_result(
     scene: Gaussians | PlyRows,
     seconds: float,
     where: Path | None,
-    quality: FullSizeQuality | str | None,
+    quality: Quality | str | None,
 ) -> None:
     """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
-    PLY in a dry run) and time, and how close the result is to the dense scene, or why that is not known."""
+    PLY in a dry run) and time, and how close the file is to the dense scene, or why that is not known."""
     from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
 
@@ -89,9 +89,11 @@ def print_result(
     print(quality or "not compared with the dense scene: nothing of it is visible")
 
 
-def psnr_text(psnr: float | None, digits: int = 1) -> str:
+def psnr_text(psnr: float | None) -> str:
     """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was compared."""
-    return "-" if psnr is None else "same" if psnr == math.inf else f"{psnr:.{digits}f}"
+    from pointsplat_ns.compression.quality import MOST_SAID
+
+    return "-" if psnr is None else "same" if psnr == math.inf else f"{min(psnr, MOST_SAID):.1f}"
 
 
 def written_size(where: Path) -> str:
@@ -101,11 +103,13 @@ def written_size(where: Path) -> str:
     return bytes_text(file_bytes(where))
 
 
-def print_distributions(before: Gaussians, after: Gaussians) -> None:
-    """Print a table of counts and quantiles, before and after."""
+def print_details(quality: Quality | None, before: Gaussians, after: Gaussians) -> None:
+    """Print the details of a quality, and a table of counts and quantiles, before and after."""
     from pointsplat_ns.compression.pictures import opacity_quantiles, size_quantiles
     from pointsplat_ns.system.terminal import print_table
 
+    if quality is not None:
+        print(quality.details)
     rows = {
         "Gaussians": lambda s: f"{len(s):,}",
         "SH degree": lambda s: f"{s.sh_degree}",

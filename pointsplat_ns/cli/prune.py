@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
-    print_distributions,
+    print_details,
     print_json,
     print_result,
     scene_result,
@@ -66,6 +65,7 @@ def prune(
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import Looking, prune_source
     from pointsplat_ns.compression.prune_file import prune_file, rows_to_prune
+    from pointsplat_ns.compression.quality import quality_of_file
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.ply import PlyRows
@@ -99,14 +99,14 @@ def prune(
     with fixed_threads(threads):
         if rows is None:
             options.need_no_folder_options(scene, jobs, shard)
-            dense, pruned, seconds, quality = prune_source(
-                scene, request, Looking(poses, resolution, up, data), progress=True, compared=suffix
-            )
+            looking = Looking(poses, resolution, up, data)
+            dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
             small, before = pruned, len(dense)
             if not dry_run:
                 ps.save(pruned, output, progress=True, overwrite=True)
-            if plot is not None:
-                with options.scene_written(written):
+            with options.scene_written(written):
+                quality = quality_of_file(dense, source, pruned, written, suffix)
+                if plot is not None:
                     ps.plot_distributions({"before": dense, "after": pruned}, plot)
         elif dry_run or plot is not None:
             raise ps.SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
@@ -119,12 +119,12 @@ def prune(
             small, quality = PlyRows.open(output), None
     assert small is not None
     if json_output:
-        compared = asdict(quality) if quality else {"psnr": None}
+        compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(before, small, seconds, written), **compared, "plot": plot})
         return
     unknown = "not compared with the dense scene: it does not fit into memory"
     print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
     if verbose and dense is not None and isinstance(small, ps.Gaussians):
-        print_distributions(dense, small)
+        print_details(quality, dense, small)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -221,7 +221,7 @@ def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
-        is_instance=lambda value: isinstance(value, (int, float)) and not isinstance(value, bool),
+        is_instance=lambda value: value is None or isinstance(value, (int, float)) and not isinstance(value, bool),
         str_from_instance=lambda value: [f"{value:g}" if isinstance(value, float) else str(value)],
     )
 
@@ -252,7 +252,13 @@ def quantities() -> ConstructorRegistry:
 
     @registry.primitive_rule
     def number_or_path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-        return path if info.type is Path else rules.get(info.type)
+        if info.type is Path:
+            return path
+        kinds = [kind for kind in get_args(info.type) or (info.type,) if kind is not type(None)]
+        if len(kinds) != 1:
+            return None
+        own = [item for item in getattr(kinds[0], "__metadata__", ()) if isinstance(item, PrimitiveConstructorSpec)]
+        return own[0] if own else rules.get(kinds[0])  # of an optional number as of the number
 
     return registry
 

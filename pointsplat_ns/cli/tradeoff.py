@@ -58,6 +58,7 @@ def tradeoff(
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
+    from pointsplat_ns.compression.quality import quality_line
     from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.points import RESULTS
     from pointsplat_ns.tradeoff.recommend import next_best
@@ -79,6 +80,8 @@ def tradeoff(
     print(found.why)
     best = found.point(found.recommended)
     best = next_best(found.points) or best if best is found.points[0] else best  # the dense scene needs no command
+    if best is not found.points[0]:
+        print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
         print(f"$ {best.command}")
     print(f"{folder}: table and pictures; open {folder / RESULTS['page']}")
@@ -91,7 +94,7 @@ def _print_table(found: Tradeoff) -> None:
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")
-    print(f"{found.scene}: {count}, {found.width} x {found.height} pixels, {found.views_origin}")
+    print(f"{found.scene}: {count}, judged in {found.judged_in}, {found.views_origin}")
     print(found.machine)
     rows = []
     for point in found.points:
@@ -104,14 +107,15 @@ def _print_table(found: Tradeoff) -> None:
                 f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
                 three_digits(point.frame_ms),
                 "-" if point.fill is None else f"{point.fill:.1f}",
-                psnr_text(point.against_dense.psnr, 2),
-                *([psnr_text(point.against_photos.psnr if point.against_photos else None, 2)] if photos else []),
+                *([psnr_text(point.against_photos.psnr if point.against_photos else None)] if photos else []),
+                psnr_text(point.against_dense.psnr),
+                f"{point.against_dense.ssim:.2f}",
             )
         )
-    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill", "dB,\nrenders"]
+    columns = ["", "Gaussians", "MB", "times as fast", "ms a\nframe", "fill"]
     print_table(
-        (*columns, *(["dB,\nphotos"] if photos else [])),
+        (*columns, *(["dB,\nphotos"] if photos else []), "dB,\ndense", "SSIM"),
         rows,
         "*: recommended; times as fast as the dense scene: median and quartiles over views; fill: Gaussians "
-        "drawn per pixel; dB of PSNR",
+        "drawn per pixel; dB of PSNR, and SSIM, against the dense scene",
     )

@@ -145,8 +145,6 @@ class FoundQuality:
     """The smallest scene found that reaches a PSNR."""
 
     scene: Gaussians
-    count: int
-    """The count that was asked for."""
     psnr: float
     """PSNR of ``scene`` over the pixels that the dense scene covers, dB; inf if nothing differs."""
     worst: float
@@ -218,34 +216,39 @@ class FoundSize:
 
 
 def smallest_within(
-    dense: Gaussians,
+    n: int,
     make: Callable[[int], Gaussians],
-    views: Views,
+    psnr_of: Callable[[Gaussians, Callable[[float], None]], tuple[float, float]],
     psnr: float,
     progress: Callable[[float], None] = lambda share: None,
 ) -> FoundQuality:
-    """Search for the smallest scene of a method whose renders reach ``psnr``, dB, against those of the dense scene in
-    some views; ``make(n)`` returns n Gaussians.
+    """Search for the smallest scene of a method that reaches ``psnr``, dB.
 
-    The PSNR is that of the mean squared error of all views, so bad views count more, over the pixels that the dense
-    scene covers. The result was rendered and reaches ``psnr``. A smaller such scene may exist where PSNR does not
-    always rise with the count. Raises BudgetError if ``psnr`` is not a positive number, if there is no view, or if not
-    even all N Gaussians reach it.
+    Args:
+        n: number of Gaussians of the dense scene.
+        make: ``make(k)`` returns k Gaussians, at most n.
+        psnr_of: gives the PSNR of a scene against the dense one and that of the worst view, dB, with its own progress.
+        psnr: to be reached, dB.
+        progress: called with the share done.
+
+    Returns:
+        A scene that was judged and reaches ``psnr``. A smaller such scene may exist where PSNR does not always rise
+        with the count.
+
+    Raises:
+        BudgetError: if ``psnr`` is not a positive number, or not even n Gaussians reach it.
     """
     if not 0 < psnr < math.inf:
         raise BudgetError(f"the wanted PSNR is {psnr} dB; expected a positive number, such as 35")
-    if len(views) == 0:
-        raise BudgetError("no view to compare renders from; expected at least one pose")
-    n, reference = len(dense), DenseReference(dense, views)
     tried: dict[int, float] = {}
     best: FoundQuality | None = None
 
     def measure(count: int) -> float:
         nonlocal best
         scene, before = make(count), len(tried)
-        tried[count], worst = reference.psnr(scene, lambda share: progress(share_done(before + share)))
+        tried[count], worst = psnr_of(scene, lambda share: progress(share_done(before + share)))
         if tried[count] >= psnr:
-            best = FoundQuality(scene, count, tried[count], worst, tried)
+            best = FoundQuality(scene, tried[count], worst, tried)
         return tried[count]
 
     first = max(1, round(FIRST_SHARE * n))

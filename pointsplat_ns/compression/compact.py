@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import math
 import time
+from typing import Literal
 
 from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
 from pointsplat_ns.compression.budget_search import FileLimit
@@ -55,7 +56,7 @@ def compact_scene(
     except DataError as error:
         uncompared = str(error)
     before = None if reference is None else reference.closeness(pruned.scene.to(at_work.device))
-    stages = [Stage("prune", pruned.scene, before)]
+    stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
         stages.append(_refined(stages[0], request.refiner, judge, progress))
     error_left = last_kept(stages).after
@@ -72,10 +73,13 @@ def compact_scene(
     return Compacted(tuple(stages), (*seen, *pruned.notes), reference, seconds, uncompared, interrupted=interrupted)
 
 
-def as_compacted(dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...]) -> Compacted:
-    """The result of :func:`compact_scene` for a scene that is only pruned, with notes on the pruning."""
+def as_compacted(
+    dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...], by: str = "merge"
+) -> Compacted:
+    """The result of :func:`compact_scene` for a scene that is only pruned by a method, with notes on the pruning."""
     reference = DenseReference(dense, views.compared())
-    return Compacted((Stage("prune", pruned, reference.closeness(pruned)),), notes, reference, 0.0)
+    name: Literal["merge", "prune"] = "merge" if by == "merge" else "prune"
+    return Compacted((Stage(name, pruned, reference.closeness(pruned)),), notes, reference, 0.0)
 
 
 def _refined(last: Stage, refiner: TrainedRefiner, judge: Comparison | None, progress: Progress) -> Stage:

@@ -8,6 +8,7 @@ from typing import Literal
 
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Reason, closer_in
 from pointsplat_ns.compression.photo_repair import PhotoRepaired
+from pointsplat_ns.compression.quality import PhotoGain
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.views import Views
@@ -17,7 +18,7 @@ from pointsplat_ns.views import Views
 class Stage:
     """One stage of compaction: its scene and its figures."""
 
-    name: Literal["prune", "refine", "repair", "photos", "round"]
+    name: Literal["merge", "prune", "refine", "repair", "photos", "round"]
     scene: Gaussians
     """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
     after: Closeness | None
@@ -115,12 +116,12 @@ class Compacted:
         return self.repaired is not None and self.repaired.accepted
 
     @property
-    def photo_psnr(self) -> float | None:
-        """PSNR of ``scene`` in the compared training photos, dB; None if it was not trained on photos."""
-        trained = self._stage("photos")
-        if trained is None or trained.photos is None:
+    def photo_gain(self) -> PhotoGain | None:
+        """What training on photos brought; None if there was none."""
+        stage = self._stage("photos")
+        if stage is None or stage.photos is None:
             return None
-        return trained.photos.after if trained.accepted else trained.photos.before
+        return PhotoGain(stage.photos.before, stage.photos.after, stage.photos.compared, stage.accepted)
 
     @property
     def before(self) -> Closeness | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pointsplat_ns.compression.compacted import Compacted
+from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.closeness import Closeness
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning.paper import log_volume
@@ -24,7 +25,13 @@ from pointsplat_ns.views import spread_indices
 
 
 @torch.no_grad()
-def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str, files: Sequence[str] = ("", "")) -> str:
+def plot_comparison(
+    dense: Gaussians,
+    result: Compacted,
+    path: Path | str,
+    files: Sequence[str] = ("", ""),
+    quality: Quality | None = None,
+) -> str:
     """Draw three of the compared views: the dense scene, and the scene after each stage, side by side.
 
     Args:
@@ -32,6 +39,7 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str, files
         result: the result of :func:`pointsplat_ns.compact`.
         path: the PNG file to write.
         files: text on the files of the dense scene and of the result, such as "room.ply, 7.42 MB", for their titles.
+        quality: of the result's file, for its title.
 
     Returns:
         A line of text: the columns of the image, or the reason for none.
@@ -53,10 +61,11 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str, files
         return f"{path}: not drawn, because there are no views"
     views, renders = result.reference.views, result.reference.renders
     rows_of = spread_indices(len(views), 3)
-    names, titles, scenes = ["dense"], [_title("dense", dense, None, files[0])], []
+    names, titles, scenes = ["dense"], [_title("dense", dense, files[0])], []
     for stage in result.stages:
         if stage.after is not None:
             name = {
+                "merge": "merged",
                 "prune": "pruned",
                 "refine": "refined",
                 "repair": "repaired",
@@ -65,16 +74,17 @@ def plot_comparison(dense: Gaussians, result: Compacted, path: Path | str, files
             }[stage.name]
             share = f" at {stage.strength:.0%}" if stage.name == "refine" and stage.strength != 1 else ""
             names.append(name + (share if stage.accepted else " (left out)"))
-            titles.append(_title(names[-1], stage.scene, stage.after, files[1] if stage is result.last else ""))
+            last = stage is result.last
+            said = [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))] if last else []
+            titles.append(_title(names[-1], stage.scene, *said))
             scenes.append(stage.scene)
     rows = [[renders[i].cpu(), *(render(scene, views[i]).cpu() for scene in scenes)] for i in rows_of]
     side_by_side(rows, titles, path)
     return f"{path}: {', '.join(names)}, side by side"
 
 
-def _title(name: str, scene: Gaussians, close: Closeness | None, file: str) -> str:
-    near = "" if close is None else ", no difference" if math.isinf(close.psnr) else f", {close.psnr:.2f} dB"
-    return f"{name}\n{len(scene):,} Gaussians{near}\n{file}"
+def _title(name: str, scene: Gaussians, *said: str) -> str:
+    return "\n".join([name, f"{len(scene):,} Gaussians", *said])
 
 
 @torch.no_grad()
@@ -107,8 +117,8 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:
-    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column. Raises
-    SceneError if the file cannot be written."""
+    """Draw a grid of images (H, W, 3) in [0, 1] of one size to a PNG file, with a title above each column, also in the
+    file's description. Raises SceneError if the file cannot be written."""
     from matplotlib.figure import Figure
 
     height, width = np.shape(rows[0][0])[:2]
@@ -123,7 +133,7 @@ def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: P
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=11)
     with replacing(path) as part:
-        figure.savefig(part, dpi=100, format="png")
+        figure.savefig(part, dpi=100, format="png", metadata={"Description": "\n".join(titles)})
 
 
 def size_quantiles(scene: Gaussians) -> list[float]:

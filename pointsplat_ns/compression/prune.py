@@ -18,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
-from pointsplat_ns.looking.closeness import DenseReference
+from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
@@ -46,8 +46,6 @@ class Pruned:
     scene: Gaussians
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, PSNR reached, origin of the views."""
-    views: Views | None = None
-    """The views that merging rendered; None if it rendered none, or for another method."""
     limit: FileLimit | None = None
     """The limit of a compressed file, and the rounding that meets it; None for another budget."""
 
@@ -66,7 +64,7 @@ def prune_scene(
     views = views or ViewSource(dense)
     full, about_sh = _with_sh(dense, request.sh, views, progress)
     count = request.count_of(len(full), full.sh_degree, full.traits)
-    start, cleaning, limit, seen, searched = full, None, None, None, ""
+    start, cleaning, limit, searched = full, None, None, ""
     if request.clean:
         from pointsplat_ns.compression.cleaning import clean_scene
 
@@ -78,7 +76,7 @@ def prune_scene(
     if count is not None and merging:
         merged = merge(start, count, report, views.for_merging())
         logger.debug("%s", merged.finish.note)
-        scene, seen = merged.scene, merged.views
+        scene = merged.scene
     elif count is not None:
         scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
     else:
@@ -91,13 +89,12 @@ def prune_scene(
             scene, limit, searched = _for_size(dense, start, make, request.budget, views, searching)
         else:
             scene, limit, searched = _for_psnr(dense, make, request.budget, views, searching)
-        seen = None if merger is None else merger.views
     if limit is not None and rounding:
         scene = limit.rounded(scene)
     about_views = views.text if views.origin else ""
     about_junk = () if cleaning is None else cleaning.notes
     notes = tuple(note for note in (about_views, about_sh, *about_junk, searched) if note)
-    return Pruned(scene, notes, seen, limit)
+    return Pruned(scene, notes, limit)
 
 
 def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -> tuple[Gaussians, str]:
@@ -116,9 +113,9 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -
         degree = int(sh)
     if degree >= dense.sh_degree:
         return dense, f"SH degree {dense.sh_degree} kept"
-    lost = 100 * energy_lost(dense, degree)
+    lost = energy_lost(dense, degree)
     cut = f"SH degree {dense.sh_degree} cut to {degree}"
-    return cut_sh(dense, degree), f"{cut}: {lost:.0f} % of what SH add to colours is lost{reached}"
+    return cut_sh(dense, degree), f"{cut}: colours change {lost:.0%} less with the view{reached}"
 
 
 def _selector(
@@ -148,27 +145,22 @@ def _for_psnr(
     """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
     scene has the PSNR when it is rounded; and a line on the search. ``make(n)`` returns n Gaussians."""
     from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
+    from pointsplat_ns.compression.quality import Judge, decibels, through_file
 
     assert isinstance(budget, WithinPsnr)
-    compared, kind = views.compared(), format_to_write(budget.suffix)
+    judge, kind = Judge(dense, views), format_to_write(budget.suffix)
     limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
-    whole: dict[int, Gaussians] = {}  # by count, where the scenes that are compared are rounded
 
-    def made(count: int) -> Gaussians:
-        scene = make(count)
-        if limit is None:
-            return scene
-        whole[count] = scene
-        return limit.rounded(scene)
+    def psnr_of(scene: Gaussians, progress: Callable[[float], None]) -> tuple[float, float]:
+        rounded = scene if limit is None else limit.rounded(scene)
+        return judge.psnr(through_file(rounded, budget.suffix)[1], progress)
 
-    reached = smallest_within(dense, made, compared, budget.value, progress)
+    reached = smallest_within(len(dense), make, psnr_of, budget.value, progress)
     note = (
-        f"{counted(len(reached.tried), 'size')} tried: no difference from the dense scene"
-        if reached.psnr == math.inf
-        else f"{counted(len(reached.tried), 'size')} tried: {reached.psnr:.1f} dB PSNR against the dense scene, "
-        f"{reached.worst:.1f} dB in the worst of {len(compared)} views"
+        f"{counted(len(reached.tried), 'size')} tried: {decibels(reached.psnr)} against the dense scene, "
+        f"{decibels(reached.worst)} in the worst of {views_text(len(judge.views))}"
     )
-    return whole.get(reached.count, reached.scene), limit, note
+    return reached.scene, limit, note
 
 
 def _for_size(

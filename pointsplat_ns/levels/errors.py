@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import Closeness, Reference
+from pointsplat_ns.looking.closeness import Reference
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -17,8 +18,8 @@ from pointsplat_ns.system.tensors import DOUBLES
 class RenderErrors:
     """Errors of a level's renders against the dense scene's own."""
 
-    near: Closeness
-    """In the compared views."""
+    near: Quality
+    """In the views that every command judges in."""
     farther: dict[int, float]
     """PSNR in dB by multiple of the distance, see :func:`far_references`."""
 

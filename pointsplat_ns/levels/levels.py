@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.formats.holding import typical_sizes
+from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth, pixel_size_for
@@ -66,6 +68,7 @@ class Level:
             "psnr": near and near.psnr,
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
+            "quality": near and str(near),
             "psnr_farther": errors and _farther(errors.farther),
         }
 
@@ -100,6 +103,8 @@ class Levels:
     """The file of the dense scene; None if it was given as Gaussians."""
     notes: tuple[str, ...]
     """Lines of text: SH bands dropped, origin of the views, why nothing was compared."""
+    judge: Judge | None
+    """Judges the levels; None if there are no views."""
 
     @property
     def scenes(self) -> list[Gaussians]:
@@ -186,6 +191,18 @@ class Levels:
         pixel = self.distance / float(self.reference.views.Ks[:, 1, 1].median())
         return [pixel_size_for(level.errors, self.farther, pixel) for level in self if level.errors is not None]
 
+    def of_stream(self, folder: str | Path, page: StreamPage | None = None) -> Levels:
+        """The same levels, judged as they are in the stream that :meth:`save_stream` wrote."""
+        levels = []
+        for index, level in enumerate(self):
+            errors = level.errors
+            if self.judge is not None and errors is not None:
+                read = read_sog_stream(folder, index)
+                read = read if page is None or page.turn is None else page.turn.inverse().apply(read)
+                errors = replace(errors, near=self.judge.quality(read))
+            levels.append(replace(level, errors=errors))
+        return replace(self, levels=tuple(levels))
+
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
         dense, file, views = self.dense, self.source, None
@@ -221,16 +238,14 @@ class Levels:
         level; none if there is no view."""
         if self.reference is None:
             return [], []
-        views, last = self.reference.views, self[-1].errors
-        assert last is not None
-        index_of_view = int(np.argsort(last.near.errors, kind="stable")[(len(views) - 1) // 2])
+        views = self.reference.views
+        index_of_view = int(np.argsort(self.reference.errors(self[-1].scene), kind="stable")[(len(views) - 1) // 2])
         images, captions = [self.reference.renders[index_of_view]], [f"dense: {len(self.dense):,} Gaussians"]
         for index, level in enumerate(self):
             assert level.errors is not None
             images.append(render(level.scene, views[index_of_view]))
             share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            psnr = level.errors.near.psnr_of_view(index_of_view)
-            captions.append(f"level {index}: {len(level.scene):,} ({share}), {psnr:.1f} dB")
+            captions.append(f"level {index}: {len(level.scene):,} ({share})\n{level.errors.near}")
         return images, captions
 
 
@@ -311,10 +326,10 @@ def make_levels(
     progress("rendering the dense scene", 0.0)
     cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
     counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.traits)
-    notes, reference, distance = cut.notes, None, None
+    notes, reference, distance, judge = cut.notes, None, None, None
     afar: dict[int, Reference] = {}
     try:
-        reference = DenseReference(dense, views.compared())
+        judge, reference = Judge(dense, views), DenseReference(dense, views.compared())
         afar = far_references(reference)
         distance = median_depth(dense, reference)
     except DataError as error:
@@ -327,10 +342,10 @@ def make_levels(
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
         errors = None
-        if reference is not None:
-            what = f"measuring level {len(made)} of {len(counts) - 1}"
-            near = reference.closeness(merged.scene, functools.partial(progress, what))
-            errors = RenderErrors(near, {times: far.psnr(merged.scene)[0] for times, far in afar.items()})
+        if judge is not None:
+            progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
+            afar_psnrs = {times: far.psnr(merged.scene)[0] for times, far in afar.items()}
+            errors = RenderErrors(judge.quality(merged.scene), afar_psnrs)
         made.append(
             Level(
                 scene=merged.scene,
@@ -341,4 +356,4 @@ def make_levels(
             )
         )
         start = time.perf_counter()
-    return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes)
+    return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes, judge)

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.each_view import each_view
-from pointsplat_ns.metrics import SSIM_WINDOW, psnr_of, ssim
+from pointsplat_ns.metrics import psnr_of
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render_with_alpha
 from pointsplat_ns.views import Views
 
@@ -27,8 +28,6 @@ class Closeness:
     """Mean squared error over all pixels of each view."""
     covered: tuple[float, ...]
     """Share of the pixels of each view that the dense scene covers, in [0, 1]."""
-    ssim: float | None = None
-    """Mean over views; None if it was not computed, or views are smaller than SSIM's window."""
     width: int | None = None
     """Width of the pictures, pixels; None if it is not known."""
 
@@ -86,22 +85,26 @@ class Reference:
         return close.psnr, close.worst
 
     def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
-        """Errors and SSIM of a scene; ``progress`` is called with the share of the views done."""
+        """Errors of a scene; ``progress`` is called with the share of the views done."""
         return self.closeness_of((image for image, _ in _drawn(scene, self.views)), progress)
 
     @torch.no_grad()
     def closeness_of(self, images: Iterable[Tensor], progress: Callable[[float], None] | None = None) -> Closeness:
-        """Errors and SSIM of C pictures (H, W, 3)."""
-        height, width = self.renders[0].shape[:2]
-        errors, similarities = [], []
+        """Errors of C pictures (H, W, 3)."""
+        errors: list[float] = []
         for image, target in zip(images, self.renders, strict=True):
             errors.append(float((image.double() - target.double()).square().mean()))
-            if min(height, width) >= SSIM_WINDOW:
-                similarities.append(float(ssim(image, target.to(image))))
             if progress is not None:
                 progress(len(errors) / len(self.renders))
-        similarity = sum(similarities) / len(similarities) if similarities else None
-        return Closeness(tuple(errors), self.covered, similarity, width)
+        return Closeness(tuple(errors), self.covered, self.views.width)
+
+    @torch.no_grad()
+    def ssim(self, scene: Gaussians) -> float:
+        """SSIM of a scene, mean over the views. Views must not be smaller than its window."""
+        total = 0.0
+        for (image, _), target in zip(_drawn(scene, self.views), self.renders, strict=True):
+            total += float(mean_ssim(image.permute(2, 0, 1)[None], target.to(image).permute(2, 0, 1)[None]))
+        return total / len(self.renders)
 
     @torch.no_grad()
     def _errors(self, pictures: Iterable[tuple[Tensor, Tensor]]) -> Iterator[float]:

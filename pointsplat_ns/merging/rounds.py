@@ -46,8 +46,6 @@ class Merged:
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
     finish: Finish
     """The numbers chosen for this scene."""
-    views: Views | None = None
-    """The views that decided, those given or sampled ones; None if nothing was rendered."""
 
 
 def merge(
@@ -131,18 +129,11 @@ class Merger:
         settings: MergeSettings = MERGING,
     ):
         self._scene, self._options = scene, (views, settings)
-        self.views: Views | None = None
-        """Those of the last result that has some, see :class:`Merged`."""
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
+    @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
         """The result of :func:`merge`, to the bit. Arguments and errors as there."""
-        merged = self._merged(k, progress)
-        self.views = self.views if merged.views is None else merged.views
-        return merged
-
-    @torch.no_grad()
-    def _merged(self, k: int, progress: Callable[[float], None] | None) -> Merged:
         settings = self._options[-1]
         if not self._steps and 1 <= k < len(self._scene):
             dense = self._scene.to(device="cpu")
@@ -219,7 +210,7 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
     assignment[step.participants.members] = group
     if step.index is not None:
         assignment = assignment[step.index]
-    return Merged(scene.to(device), assignment.to(device), finish, step.viewpoints.views if step.viewpoints else None)
+    return Merged(scene.to(device), assignment.to(device), finish)
 
 
 @dataclass(eq=False)

@@ -6,14 +6,12 @@ import functools
 import itertools
 import math
 import shlex
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.compact import compact_scene
@@ -25,16 +23,14 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.compression.trained_refiner import SHIPPED, TrainedRefiner, load_refiner
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import may_be_run, name_of
-from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, view_source
-from pointsplat_ns.pruning import Keep, method_named, parse_keep, ply_bytes, resolve_keep
+from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.system.memory import PeakMemory
-from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, REPAIRS, Repair, Setting
 from pointsplat_ns.views import Views
 
@@ -222,17 +218,3 @@ def make(
             raise KeyboardInterrupt
         scene, notes = compacted.scene, compacted.notes
     return MadeScene(scene.to(dense.device), time.perf_counter() - start, peak.bytes(), notes, compacted)
-
-
-def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:
-    """The size of a scene's file of a suffix such as ``.spz`` in bytes, and the scene after writing and reading: exact
-    for a PLY, with fewer bits for other formats. Formats without a reader, such as ``.glb``, return ``scene``."""
-    kind = format_to_write(suffix)
-    if kind.suffix == ".ply":
-        return ply_bytes(len(scene), scene.sh_degree), scene
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"scene{suffix}"
-        assert kind.write is not None
-        # Without the warning of losses, which is for the scene that is kept.
-        kind.write(usable_part(scene.detach().to("cpu", torch.float32)), path, silent)
-        return path.stat().st_size, scene if kind.read is None else kind.read(path).to(scene.device)

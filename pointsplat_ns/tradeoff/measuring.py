@@ -23,22 +23,21 @@ from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compact import rounding_stage
+from pointsplat_ns.compression.quality import Judge, through_file
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
-from pointsplat_ns.looking.closeness import DenseReference, views_text
-from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, ImageError, finite_psnr, ssim
+from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.pruning import cut_sh, need_usable
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.tradeoff.making import MadeScene, Subject, make, through_file
+from pointsplat_ns.tradeoff.making import MadeScene, Subject, make
 from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting
 from pointsplat_ns.views import View, Views
 
@@ -47,24 +46,18 @@ ROUNDS = 3
 
 
 class JudgedViews(NamedTuple):
-    """The views that scenes are judged in."""
+    """The views that scenes are drawn and timed in, and compared with photos."""
 
     views: Views
     photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
     origin: str
     """Text on the origin of the views."""
 
-    @property
-    def where(self) -> str:
-        """Text: the number of views, and their width."""
-        of = "" if self.photos is None else " of held-out photos"
-        return f"{views_text(len(self.views))}{of}, {self.views.width} pixels wide"
-
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
-    """At most ``count`` views to judge scenes in, of the size of comparisons in ``compact``, and a note. They are the
-    views of held-out photos, which are averaged over the areas of pixels, or else the views of comparisons in
-    ``compact``, which no repair uses. Raises DataError if there are none."""
+    """At most ``count`` views of a middle size, and a note. They are the views of held-out photos, which are averaged
+    over the areas of pixels, or else those of the :class:`~pointsplat_ns.compression.quality.Judge`. Raises DataError
+    if there are none."""
     note = ""
     if subject.held_out is not None:
         try:
@@ -87,12 +80,12 @@ def _averaged(photo: Tensor, height: int, width: int) -> Tensor:
 
 
 class Measurer:
-    """Makes scenes of settings, and measures them in the same views against the same pictures: the dense scene's
-    renders, and photos if there are some.
+    """Makes scenes of settings, judges them as every command does, and measures them in the same views: frame times,
+    and errors against photos if there are some.
 
     Args:
         subject: the scene.
-        views: largest number of views.
+        views: largest number of views that are timed, and of photos.
         progress: called with the task and its share done.
         timed: whether frames are timed; if not, times are NaN.
 
@@ -109,6 +102,7 @@ class Measurer:
         self.notes: dict[str, None] = {}
         self._kept: dict[Setting, MadeScene] = {}
         progress("looking for views", 0.0)
+        self.judge = Judge(self.dense, subject.new_views())
         self.judged_views, note = views_to_judge(subject, views)
         self.note(note)
         shown = self.judged_views.views
@@ -121,38 +115,32 @@ class Measurer:
             self.notes[text] = None
 
     @functools.cached_property
-    def reference(self) -> DenseReference:
-        """Renders of the dense scene."""
-        return DenseReference(self.dense, self.judged_views.views)
+    def renders(self) -> list[Tensor]:
+        """Renders of the dense scene, for LPIPS."""
+        return [render(self.dense, view) for view in self.judged_views.views]
 
     @functools.cached_property
     def lpips(self) -> Lpips | None:
         """LPIPS for pictures of this size; None without its weights, with a note. Nothing is downloaded."""
-        image = self.reference.renders[0]
+        image = self.renders[0]
         try:
             lpips = load_lpips("alex", download=False).to(image.device)
             lpips(image, image)
             return lpips
         except LpipsUnavailable:  # its text names folders, which the page must not show
-            self.note("LPIPS is missing: its weights are not at hand; see docs/training.md on POINTSPLAT_LPIPS_WEIGHTS")
+            self.note("LPIPS is missing: its weights are not at hand; POINTSPLAT_LPIPS_WEIGHTS names their folder")
         except ImageError as error:  # an image too small for the network
             self.note(f"LPIPS is missing: {error}")
         return None
 
-    @torch.no_grad()
-    def psnr(self, scene: Gaussians) -> float:
-        """PSNR of a scene against the dense scene's renders, over the pixels that the dense scene covers, dB."""
-        return min(self.reference.psnr(scene)[0], MOST_PSNR)
-
     def cut_psnr(self, degree: int) -> float:
         """PSNR in dB of the dense scene's renders without the SH bands above a degree, against all bands."""
-        return self.psnr(cut_sh(self.dense, degree))
+        return self.judge.psnr(cut_sh(self.dense, degree))[0]
 
     def measure_dense(self, show: Progress) -> Point:
         """The dense scene's point; ``show`` as for :meth:`measure`."""
         setting = Setting(len(self.dense), self.dense.sh_degree, by=DENSE)
-        point = self._point(setting, MadeScene(self.dense, 0.0, None), show)
-        return replace(point, against_dense=replace(point.against_dense, psnr=math.inf))
+        return self._point(setting, MadeScene(self.dense, 0.0, None), show)
 
     def measure(self, setting: Setting, show: Progress) -> Point:
         """The point of a setting. ``show`` is called with the name of the current task and its share done."""
@@ -171,7 +159,7 @@ class Measurer:
     def _rounded(self, made: MadeScene) -> MadeScene:
         """The scene of a compressed file: its numbers are rounded as far as its error allows, as by ``--keep auto``."""
         kind = format_to_write(self.subject.suffix)
-        if kind.rounded is None or (psnr := self.psnr(made.scene)) > ROUNDING.best_psnr:
+        if kind.rounded is None or (psnr := self.judge.psnr(made.scene)[0]) > ROUNDING.best_psnr:
             return made
         limit, compacted = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree)), made.compacted
         if compacted is None:
@@ -194,19 +182,20 @@ class Measurer:
     @torch.no_grad()
     def _compared(self, scene: Gaussians, progress: Callable[[float], None]) -> dict[str, Any]:
         """The figures of a point that are seen in its renders."""
-        (views, photos, _), images, against_photos = self.judged_views, [], None
-        for view in views:
+        (views, photos, _), images, against_photos, quality = self.judged_views, [], None, self.judge.quality(scene)
+        drawn = views if self.lpips is not None or photos is not None else views[:0]
+        progress(1 / (1 + len(drawn)))
+        for view in drawn:
             images.append(render(scene, view))
-            progress(len(images) / len(views))
+            progress((1 + len(images)) / (1 + len(drawn)))
         if photos is not None:
             pairs = [(image, photo.to(image)) for image, photo in zip(images, photos, strict=True)]
             psnr, similarity = (fmean(float(metric(*pair)) for pair in pairs) for metric in (finite_psnr, ssim))
             against_photos = ImageMetrics(psnr, similarity, self._perceived(pairs))
-        close = self.reference.closeness_of(images)
-        assert close.ssim is not None
-        perceived = self._perceived(zip(images, self.reference.renders, strict=True))
-        against_dense = ImageMetrics(min(close.psnr, MOST_PSNR), close.ssim, perceived)
-        return {"against_dense": against_dense, "against_photos": against_photos, "fill": fill(scene, views)}
+        perceived = None if self.lpips is None else self._perceived(zip(images, self.renders, strict=True))
+        assert quality.ssim is not None
+        against_dense = ImageMetrics(quality.psnr, quality.ssim, perceived)
+        return {"against_dense": against_dense, "against_photos": against_photos, "fill": quality.fill}
 
     def _perceived(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> float | None:
         """Mean LPIPS over pairs of pictures; None without its weights."""

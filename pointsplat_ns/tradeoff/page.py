@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pointsplat_ns.compression.quality import word_for
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import read_text, replacing, three_digits, write_json
@@ -124,6 +125,7 @@ def _values(sweep: Tradeoff, views: int) -> dict[str, Any]:
         "metrics": [name for name in METRICS if measured("renders", name)],
         "speed_of": speed_of,
         "metric_of": metric_of,
+        "word_for": word_for,
         "three_digits": three_digits,
         "infinity": math.inf,
         "amplified": ERROR_GAIN,

@@ -31,7 +31,7 @@ DENSE = "dense"
 RESULTS = {"json": FOLDER_FILES.sweep, "table": "tradeoff.csv", "page": "tradeoff.html"}
 """Names of the results in their folder, beside its pictures."""
 
-VERSION = 5
+VERSION = 6
 """Version of the JSON. Points of another version are not comparable."""
 
 
@@ -81,8 +81,9 @@ class Point:
     bytes: int
     """Size of the file."""
     against_dense: ImageMetrics
-    """Quality against renders of the dense scene. The PSNR is that of the mean squared error of all views, over the
-    pixels that the dense scene covers; the dense scene's own is infinite."""
+    """Quality against renders of the dense scene, as every command says it
+    (:mod:`~pointsplat_ns.compression.quality`); the dense scene's own PSNR is infinite. LPIPS is that of the
+    pictures."""
     against_photos: ImageMetrics | None
     """Quality against held-out photos; None where there are none."""
     frame_ms: float
@@ -138,7 +139,7 @@ class Tradeoff:
     """Origin of the views."""
     width: int
     height: int
-    """Size of the views, in pixels."""
+    """Size of the pictures, in pixels."""
     points: tuple[Point, ...]
     notes: tuple[str, ...] = ()
     """Lines of text for the reader, such as on a busy machine or missing LPIPS."""
@@ -152,6 +153,8 @@ class Tradeoff:
     """Text on the reason for it, and its cost."""
     target: str = ""
     """Text on the targets that were searched for, such as "at least 32 dB"; empty for a table."""
+    judged_in: str = ""
+    """Number and size of the views that scenes are judged in, as text."""
 
     def point(self, key: str) -> Point:
         """The point with a key. Raises KeyError if there is no such point."""

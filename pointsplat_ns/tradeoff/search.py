@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from pointsplat_ns.compression.budget_search import FIRST_SHARE, find_count, find_size
 from pointsplat_ns.compression.compact import as_compacted
 from pointsplat_ns.compression.compacted import Compacted
+from pointsplat_ns.compression.quality import decibels, through_file
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
@@ -26,7 +27,7 @@ from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import cut_sh, ply_bytes, resolve_keep
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.tradeoff.making import Subject, through_file
+from pointsplat_ns.tradeoff.making import Subject
 from pointsplat_ns.tradeoff.measuring import Measurer, busy_note
 from pointsplat_ns.tradeoff.points import Point, Repair, Setting
 
@@ -112,11 +113,6 @@ class Found:
     why: str
 
 
-def psnr_text(psnr: float) -> str:
-    """A PSNR against a reference, dB, of pictures of 256 levels or more."""
-    return f"{psnr:.2f} dB against" if psnr < MOST_PSNR else "no difference from"
-
-
 class TargetSearch:
     """Searches for the cheapest scene that meets targets.
 
@@ -127,7 +123,7 @@ class TargetSearch:
         measure: from a setting to its point; deterministic.
         cut_psnr: from an SH degree to the PSNR in dB of the dense scene's renders without the bands above, against all
             bands.
-        where: text on the views that points are measured in.
+        where: text on the views that points are judged in.
         size: bytes of a file by count and SH degree, or an estimate; by default of a PLY.
         exact: whether files keep scenes exactly, as a PLY does.
     """
@@ -260,7 +256,7 @@ class TargetSearch:
         point = self._point(setting)
         time = "" if math.isnan(point.frame_ms) else f"{point.frame_ms:.3g} ms a frame, "
         why = (
-            f"{point.label}: {psnr_text(point.against_dense.psnr)} the dense scene's renders in {self.where}, "
+            f"{point.label}: {decibels(point.against_dense.psnr)} against the dense scene in {self.where}, "
             f"{time}{bytes_text(point.bytes)}, {point.gaussians:,} Gaussians; {counted(len(self.tried), 'scene')} tried"
         )
         cheaper = [s for s, p in self.tried.items() if self.targets.missed(p) and self._cost(s) < self._cost(setting)]
@@ -289,9 +285,9 @@ def find_scene(
     """Find the cheapest scene that meets targets by :class:`TargetSearch`, with a method of pruning and the repairs to
     try, without a folder of measurements: ``compact --target-db``.
 
-    Scenes are judged in the views of :func:`~pointsplat_ns.tradeoff.measuring.views_to_judge`, after writing and
-    reading them in the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the
-    cheapest scene found so far.
+    Scenes are judged as commands say it (:mod:`~pointsplat_ns.compression.quality`), after writing and reading them in
+    the subject's format. Frames are timed only for a target of time. Ctrl-C ends the search with the cheapest scene
+    found so far.
 
     Raises:
         BudgetError: if no scene meets all targets; the text tells the reachable values.
@@ -311,7 +307,7 @@ def find_scene(
     size, bytes_of = _estimated(subject), kind.bytes_of
     if bytes_of is not None:
         size = lambda count, degree: bytes_of(count, degree, dense.traits)  # noqa: E731
-    where, exact = measurer.judged_views.where, kind.suffix == ".ply"
+    where, exact = measurer.judge.where, kind.suffix == ".ply"
     search = TargetSearch(
         targets, Setting(len(dense), dense.sh_degree, by=by), repairs, measure, measurer.cut_psnr, where, size, exact
     )
@@ -328,12 +324,10 @@ def find_scene(
     if timed:
         measurer.note(busy_note([point.others_cores for point in search.tried.values()]))
     made = measurer.made(found.setting, progress)
-    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes)
+    compacted = made.compacted or as_compacted(dense, made.scene, subject.new_views(), made.notes, by)
     notes = tuple(dict.fromkeys((*measurer.notes, *compacted.notes)))
-    seconds, why = time.perf_counter() - start, found.why
-    if measurer.judged_views.photos is not None and compacted.last.after is not None and len(compacted.stages) > 1:
-        why += f"; a repair is accepted in {compacted.last.after.where} of the photos that were trained on"
-    return replace(compacted, target=why, interrupted=interrupted, notes=notes, seconds=seconds)
+    seconds = time.perf_counter() - start
+    return replace(compacted, target=found.why, interrupted=interrupted, notes=notes, seconds=seconds)
 
 
 def _estimated(subject: Subject) -> Callable[[int, int], int]:

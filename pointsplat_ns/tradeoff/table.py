@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 from pointsplat_ns.compression.posed_scene import check_photos
+from pointsplat_ns.compression.quality import decibels
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
@@ -42,7 +43,7 @@ from pointsplat_ns.tradeoff.points import (
     write_table,
 )
 from pointsplat_ns.tradeoff.recommend import recommend
-from pointsplat_ns.tradeoff.search import Targets, TargetSearch, psnr_text, targets_of
+from pointsplat_ns.tradeoff.search import Targets, TargetSearch, targets_of
 from pointsplat_ns.views import spread_indices
 
 logger = logging.getLogger("pointsplat_ns")
@@ -91,10 +92,11 @@ def measure_tradeoff(
         sh: SH degrees: "all" for all bands, a digit for those up to a degree.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and
             "photos", its training on the photos of a run.
-        views: largest number of views; without photos at most 12.
+        views: largest number of views that are timed, and of photos; without photos at most 12.
         poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
-        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged and timed in the pictures that
-            :func:`pointsplat_ns.compact` compares in, of 784 x 441 pixels for 1920 x 1080; photos are reduced to them.
+        resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged in pictures of this size, as by every
+            command. Frames are timed, and pictures drawn, at a middle size, of 784 x 441 pixels for 1920 x 1080; photos
+            are reduced to it.
         up: as for :func:`pointsplat_ns.prune`.
         data: as for :func:`pointsplat_ns.prune`.
         target_db: least PSNR against the dense scene's renders, over the pixels that it covers, dB.
@@ -182,6 +184,7 @@ class Sweep:
             "number of views": len(judged.views),
             "width": judged.views.width,
             "height": judged.views.height,
+            "judged in": self.measurer.judge.where,
             "resolution": "" if subject.resolution is None else size_text(subject.resolution),
             # Sampled ones may differ by rounding.
             "cameras": "" if subject.new_views().given is None else hashlib.sha256(cameras).hexdigest()[:16],
@@ -212,7 +215,7 @@ class Sweep:
         measurer = self.measurer
         with self._finished_early():
             self.measure(self.dense)
-            whole, where = replace(self.dense, by=by), measurer.judged_views.where
+            whole, where = replace(self.dense, by=by), measurer.judge.where
             search = TargetSearch(targets, whole, repairs, self.measure, measurer.cut_psnr, where)
             try:
                 found = search.run()
@@ -280,6 +283,7 @@ class Sweep:
             views_origin=judged.origin,
             width=judged.views.width,
             height=judged.views.height,
+            judged_in=self.measurer.judge.where,
             points=points,
             notes=(*([busy] if busy else []), *self.measurer.notes),
             times_trusted=not busy,
@@ -313,6 +317,6 @@ class Sweep:
             keep_scene(self._frame, scene, point, self.folder)
         self.points[setting] = point
         write_points(self.result(), self.identity, self.folder)
-        figures = [] if setting == self.dense else [f"{psnr_text(point.against_dense.psnr)} the dense scene"]
-        figures += [] if point.against_photos is None else [f"{point.against_photos.psnr:.2f} dB against photos"]
+        figures = [] if point.against_photos is None else [f"{point.against_photos.psnr:.1f} dB against photos"]
+        figures += [] if setting == self.dense else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
         logger.info("%s: %s", point.label, ", ".join([*figures, bytes_text(point.bytes)]))

@@ -65,7 +65,7 @@ def refusal(capsys, output: Path, *args) -> str:
 
 def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys):
     output = tmp_path / "new" / "small.ply"
-    run("compact", ply, "--refiner", helps, "-o", output, "--picture", tmp_path / "shown.png")
+    run("compact", ply, "--refiner", helps, "-o", output, "--picture", tmp_path / "shown.png", "--verbose")
     kept = prune(read_ply(ply), 0.5, "opacity")
     assert same(read_ply(output), kept.replace(scales=kept.scales + 0.05))
     said = capsys.readouterr().out
@@ -89,7 +89,7 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     said = capsys.readouterr().out
     assert f"{shown}: {bytes_text(shown.stat().st_size)}, to fly through in a browser" in said
     text = shown.read_text("utf-8")
-    quality = re.search(r"(?m)^[\d.]+ dB PSNR against the dense scene .*", said)[0]
+    quality = re.search(r"(?m)^[\d.]+ dB, SSIM 0.\d\d: .*", said)[0]
     assert f">{quality}<" in text and "<h1>room</h1>" in text
     flight = parts_of(shown).data["flight"]
     files = [f"{path.name}, {bytes_text(path.stat().st_size)}" for path in (ply, output)]
@@ -97,7 +97,8 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
         (f"dense ({files[0]})", "150 Gaussians"),
         (f"compact ({files[1]})", "75 Gaussians"),
     ]
-    assert [titles[0].splitlines()[-1], titles[-1].splitlines()[-1]] == files
+    assert titles[0].splitlines()[2:] == files[:1]
+    assert titles[-1].splitlines()[2:] == [files[1], *quality.split(": ")]
     assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
     limit = str(shown.stat().st_size / 1e6 - 0.0005)  # a little too small for both
     run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--html-limit", limit, "--force")
@@ -117,7 +118,7 @@ def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(hel
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(acceptance, "DenseReference", Watched)
-        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply")
+        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply", "--verbose")
     assert "poses of the dataset" in capsys.readouterr().out
     assert seen == [("antialiased", [1.0, 1.0, 1.0], 64)]
     assert len(read_ply(tmp_path / "small.ply")) == round(len(read_scene(source)) / 2 + 0.1)
@@ -171,6 +172,7 @@ def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_sa
     monkeypatch.setattr(acceptance, "closer_in", lambda before, after: len(before.errors))
     write_ply(room(400), tmp_path / "room.ply")
     options = ("--refiner", helps, "--keep", "40", "--by", "merge", "--effort", "quick", "-o", tmp_path / "small.ply")
+    options += ("--verbose",)
     run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
     said = " ".join(capsys.readouterr().out.split())
     found = re.search(

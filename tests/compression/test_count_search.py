@@ -93,8 +93,8 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_b
         calls.append(count)
         return hollow_ball[select(scores, count)]
 
-    found = smallest_within(hollow_ball, make, ball_views, wanted, shares.append)
     reference = DenseReference(hollow_ball, ball_views)
+    found = smallest_within(len(hollow_ball), make, reference.psnr, wanted, shares.append)
     assert found.psnr == reference.psnr(found.scene)[0] >= wanted and found.worst <= found.psnr + 1e-9
     count = len(found.scene)
     below = [k for k in calls if k < count]
@@ -106,17 +106,17 @@ def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_b
 
 
 def test_a_psnr_that_any_scene_reaches_keeps_one_gaussian(hollow_ball, ball_views):
-    assert len(smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views, 0.1).scene) == 1
+    psnr_of = DenseReference(hollow_ball, ball_views).psnr
+    assert len(smallest_within(len(hollow_ball), lambda k: hollow_ball[:k], psnr_of, 0.1).scene) == 1
 
 
 def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
+    psnr_of = DenseReference(hollow_ball, ball_views).psnr
     with pytest.raises(BudgetError, match="all 1500 Gaussians reach .* dB, not 60 dB"):
-        smallest_within(hollow_ball, lambda k: cut_sh(hollow_ball, 0)[:k], ball_views, 60.0)
+        smallest_within(len(hollow_ball), lambda k: cut_sh(hollow_ball, 0)[:k], psnr_of, 60.0)
     for wanted in (0.0, -3.0, math.nan, math.inf):
         with pytest.raises(BudgetError, match="expected a positive number"):
-            smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views, wanted)
-    with pytest.raises(BudgetError, match="no view"):
-        smallest_within(hollow_ball, lambda k: hollow_ball[:k], ball_views[:0], 30.0)
+            smallest_within(len(hollow_ball), lambda k: hollow_ball[:k], psnr_of, wanted)
 
 
 def test_the_sh_degree_found_is_the_lowest_that_is_good_enough(hollow_ball, ball_views):

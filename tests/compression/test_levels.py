@@ -11,6 +11,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
+from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.levels import folder as level_folder
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.merging import merge_levels
@@ -121,7 +122,8 @@ def test_the_errors_in_the_manifest_are_those_of_the_files(folder, scene, views)
         assert level["psnr"] == pytest.approx(psnr((gaps**2).mean() / covered.mean()), abs=1e-6)
         assert level["worst_psnr"] == pytest.approx(psnr(((gaps**2).mean(axis=(1, 2, 3)) / covered).max()), abs=1e-6)
         similar = [float(ps.ssim(a, b)) for a, b in zip(images, dense, strict=True)]
-        assert level["ssim"] == pytest.approx(sum(similar) / 3, abs=1e-6)
+        assert level["ssim"] == pytest.approx(1 - (1 - sum(similar) / 3) / covered.mean(), abs=1e-6)
+        assert level["quality"].startswith(f"{level['psnr']:.1f} dB, SSIM {level['ssim']:.2f}: ")
         assert [error["times"] for error in level["psnr_farther"]] == [2, 4, 8]
 
 
@@ -129,7 +131,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("where", [(DenseReference, "closeness"), (level_folder, "write_ply"), (level_folder, "_draw")])
+@pytest.mark.parametrize("where", [(Judge, "quality"), (level_folder, "write_ply"), (level_folder, "_draw")])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scene, views, tmp_path, monkeypatch):
     def failing(*_, **__):
@@ -203,6 +205,6 @@ def test_levels_that_do_not_fit_are_refused_and_nothing_is_written(asked, messag
 def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, views):
     cut = ps.lod(scene, ["100%", "10%"], sh="0", views=views)
     assert [level.scene.sh_degree for level in cut] == [0, 0] and cut.dense.sh_degree == 1
-    assert 0 < cut[0].errors.near.error < cut[1].errors.near.error
+    assert 0 < cut[1].errors.near.psnr < cut[0].errors.near.psnr
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
     assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))

@@ -166,7 +166,7 @@ def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
 def test_a_run_is_compacted_with_its_photos(trained_walls):
     (config,) = (trained_walls / "wall-a").rglob("config.yml")
     result = ps.compact(config.parent, "50%", effort="quick", photos=True)
-    assert result.stages[-1].name == "photos" and result.photo_psnr > 5
+    assert result.stages[-1].name == "photos" and result.photo_gain.after > 5
     with pytest.raises(BudgetError, match="expected targets or photos"):
         ps.compact(config.parent, photos=True, target_db=20)
 

@@ -1,13 +1,19 @@
-"""The figure of quality that commands print."""
+"""The one judgement of a written scene, and its text."""
+
+import math
+from dataclasses import replace
 
 import pytest
-import torch
 
 from making import box_room
-from pointsplat_ns.compression.quality import FullSizeQuality, quality_of
+from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, quality_of_file, through_file
+from pointsplat_ns.io import save
 from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.looking.view_source import ViewSource
+
+SOME = Quality(28.84, 24.2, 0.9132, 12, 1920, 1080, "given views", 33.84, 12.06)
 
 
 @pytest.fixture(scope="module")
@@ -15,32 +21,58 @@ def dense():
     return box_room(0, 400)
 
 
-def test_the_figure_is_that_of_whole_pictures_over_covered_pixels(dense):
-    small = dense[::3]
-    views = sample_views(dense, 3, 64, 48)
-    assert quality_of(dense, small, views).psnr == DenseReference(dense, views).psnr(small)[0]
-    large = sample_views(dense, 3, 1280, 960)
-    subsampled = quality_of(dense, small, large)
-    assert subsampled.psnr == pytest.approx(DenseReference(dense, large).psnr(small)[0], abs=0.1)
-    assert (subsampled.views, subsampled.width, subsampled.height) == (3, 1280, 960)
+def test_the_figures_are_those_of_whole_pictures_over_covered_pixels(dense):
+    small, views = dense[::3], sample_views(dense, 3, 64, 48)
+    found, whole = Judge(dense, ViewSource(dense, views)).quality(small), DenseReference(dense, views)
+    assert (found.psnr, found.worst) == whole.psnr(small)
+    assert found.ssim == pytest.approx(1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 3), abs=1e-6)
+    assert (found.fill_before, found.fill) == (fill(dense, views), fill(small, views))
 
 
-def test_the_quality_is_said_with_the_views_and_their_size(dense):
-    close, drawn = str(FullSizeQuality(31.249, 8, 1920, 1080, 33.84, 12.06)).splitlines()
-    assert close == "31.2 dB PSNR against the dense scene (8 views, 1920 x 1080)"
-    assert drawn == "fill: 33.8 -> 12.1 Gaussians drawn per pixel"
-    same = quality_of(dense, dense, sample_views(dense, 1, 64, 48))
-    assert str(same).startswith("no difference from the dense scene (1 view, 64 x 48)\n")
+def test_few_pixels_of_large_pictures_stand_for_all(dense):
+    small, views = dense[::3], sample_views(dense, 12, 960, 720)
+    found, whole = Judge(dense, ViewSource(dense, views)).quality(small), DenseReference(dense, views)
+    assert found.psnr == pytest.approx(whole.psnr(small)[0], abs=0.1)
+    assert found.ssim == pytest.approx(1 - (1 - whole.ssim(small)) / (sum(whole.covered) / 12), abs=0.05)
+    assert (found.views, found.width, found.height) == (12, 960, 720)
 
 
-def test_fill_is_that_of_both_scenes_in_the_compared_views(dense):
-    views = sample_views(dense, 2, 64, 48)
-    found = quality_of(dense, dense[::3], views[1:])
-    assert (found.fill_before, found.fill) == (fill(dense, views[1:]), fill(dense[::3], views[1:]))
-    assert 0 < found.fill < found.fill_before
+def test_a_file_that_loses_is_judged_as_it_is_read(dense, tmp_path):
+    source = ViewSource(dense, sample_views(dense, 2, 64, 48))
+    save(dense, tmp_path / "same.splat")
+    read = through_file(dense, ".splat")[1]
+    wanted = Judge(dense, source).quality(read)
+    assert 10 < wanted.psnr < 60 and "looks the same" not in str(wanted)
+    for path in (None, tmp_path / "same.splat"):
+        assert quality_of_file(dense, source, dense, path, ".splat") == wanted
+    exact = quality_of_file(dense, source, dense, None, ".ply")
+    assert str(exact) == "more than 60 dB, SSIM 1.00: looks the same" and "inf" not in exact.details
 
 
-def test_views_that_the_finish_of_merging_compared_are_left_out(dense):
-    views, small = sample_views(dense, 6, 64, 48), dense[::3]
-    assert len(views) == 6
-    assert quality_of(dense, small, views).psnr == quality_of(dense, small, views[torch.tensor([1, 4])]).psnr
+@pytest.mark.parametrize(
+    "psnr, line",
+    [
+        (math.inf, "more than 60 dB, SSIM 0.91: looks the same"),
+        (40.0, "40.0 dB, SSIM 0.91: looks the same"),
+        (28.84, "28.8 dB, SSIM 0.91: edges of small things blur"),
+        (-3.0, "-3.0 dB, SSIM 0.91: only large shapes are left"),
+    ],
+)
+def test_one_line_says_how_good_a_scene_is(psnr, line):
+    assert str(replace(SOME, psnr=psnr)) == line == replace(SOME, psnr=psnr).as_dict()["quality"]
+
+
+def test_photos_lead_where_they_were_trained_on():
+    trained = replace(SOME, photos=PhotoGain(19.24, 26.1, 12, kept=True))
+    assert str(trained) == (
+        "19.2 -> 26.1 dB in 12 photos; against the dense scene, no longer the aim, 28.8 dB, SSIM 0.91"
+    )
+    left_out = replace(SOME, photos=PhotoGain(19.24, 19.1, 12, kept=False))
+    assert str(left_out) == (
+        "19.2 dB in 12 photos, which training on them does not raise; 28.8 dB, SSIM 0.91: edges of small things blur"
+    )
+
+
+def test_where_nothing_is_visible_nothing_is_judged(dense):
+    unseen = dense.replace(opacities=dense.opacities - 100)
+    assert quality_of_file(unseen, ViewSource(unseen), unseen, None, ".ply") is None

@@ -154,7 +154,7 @@ def test_where_only_copies_go_nothing_is_drawn_or_compared(monkeypatch):
     for name in ("views_and_weights", "other_neighbours", "pair_costs"):
         monkeypatch.setattr(rounds, name, lambda *given: pytest.fail("no pair is to be chosen"))
     merged = rounds.merge(scene, 1500)
-    assert len(merged.scene) == 1500 and merged.views is None
+    assert len(merged.scene) == 1500 and merged.finish.psnr is None
     assert len(merged.assignment.unique()) == 1500 and int(merged.assignment.min()) == 0
     with pytest.raises(pytest.fail.Exception):
         rounds.merge(scene.replace(means=scene.means + torch.arange(5000)[:, None]), 1500)

@@ -126,7 +126,7 @@ class ReplicaDataParser(DataParser):
 
     def _seed_points(self, train: ReplicaScene, principal_point: tuple[float, float]) -> dict[str, torch.Tensor]:
         if train.depths is None:
-            CONSOLE.log(f"{train.folder}: no depth images, so no seed points; training starts from random ones")
+            CONSOLE.log(f"{train.folder}: no depth images, so no seed points, and a training starts from random ones")
             return {}
         xyz, rgb = fuse_depth(train, self.config.num_seed_points, principal_point)
         if len(xyz) == 0:

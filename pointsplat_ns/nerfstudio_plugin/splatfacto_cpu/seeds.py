@@ -70,9 +70,9 @@ def finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] |
     if not finite.all():
         CONSOLE.log(f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped")
     if not finite.any():
-        CONSOLE.log("no seed points are left; training starts from random ones")
+        CONSOLE.log("no seed points are left; a training starts from random ones")
         return None
     if len(colors) > 0 and not colors.any():
-        CONSOLE.log("all seed points are black, as where colours are unknown; training starts from random colours")
+        CONSOLE.log("all seed points are black, as where colours are unknown; a training starts from random colours")
         colors = colors[:0]
     return points[finite].clone(), colors.clone()
