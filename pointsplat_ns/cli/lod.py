@@ -59,7 +59,7 @@ def lod(
 
     options.need_one_scene(scene)
     options.check_poses(poses)
-    folder = output or options.output_beside(scene, "stream" if stream else "lod").with_suffix("")
+    folder = output or options.output_beside(scene, "stream" if stream else "lod", "")
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if stream else levels, sh=sh, views=poses, resolution=resolution, up=up,
