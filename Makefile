@@ -45,7 +45,7 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
 
 demo: $(STAMP)
-	$(VENV)/bin/pointsplat demo
+	$(VENV)/bin/python -m lab.demo
 
 clean:
 	rm -rf pointsplat_ns/system/kernels.*.so build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis

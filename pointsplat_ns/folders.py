@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
+
+import torch
 
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import judge_of
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import refiner_at
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.discovery import FOLDER_FILES
 from pointsplat_ns.io.formats import format_like, format_to_write
-from pointsplat_ns.io.scene import source_file
+from pointsplat_ns.io.outputs import need_new, need_suffix
+from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
+from pointsplat_ns.pages.gallery import draw_pair, write_gallery, write_sheet
 from pointsplat_ns.placing import place
 from pointsplat_ns.pruning import Keep, cut_sh
 from pointsplat_ns.scene_folder import (
@@ -33,7 +39,7 @@ from pointsplat_ns.scene_folder import (
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.tradeoff.making import subject_of
-from pointsplat_ns.tradeoff.points import Repair, repairs_of
+from pointsplat_ns.tradeoff.points import repairs_of
 from pointsplat_ns.tradeoff.search import Targets, find_scene, targets_of
 
 
@@ -54,8 +60,10 @@ def compact_folder(
     target_mb: float | None = None,
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
+    target_format: str | None = None,
+    html: str | Path | None = None,
+    picture: str | Path | None = None,
     jobs: int = 1,
-    shard: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
@@ -69,8 +77,8 @@ def compact_folder(
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
             by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
             file, or is a PLY where that cannot be written.
-        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with fewer
-            Gaussians than a count is kept whole.
+        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with no more
+            Gaussians than a count is copied.
         refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
         by, sh, clean, effort: as for :func:`compact`.
         seconds: duration of the repair of each scene, as for :func:`compact`.
@@ -78,20 +86,24 @@ def compact_folder(
         resolution: as for :func:`prune`.
         data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
             data is not found gets sampled views, and a note.
+        target_format: suffix of all results, such as ".sog"; by default each result has the format of its scene.
+        html: an .html file for a gallery of all scenes before and after, with links to their files. It is written at
+            the end, also after an interruption, from what is finished.
+        picture: a .png file for the same pictures.
         jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
             is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
-        shard: only a part of the scenes: "2/5" is the second of five.
         force: overwrite files of other origin, changed files, and results with other options.
         progress: True shows a bar; a function is called with the name of the current task and its share done.
 
     Returns:
-        The result of each scene of the shard, sorted by name. A failing scene does not stop the others; its status is
+        The result of each scene, sorted by name. A failing scene does not stop the others; its status is
         "failed".
 
     Raises:
         BudgetError, PointSplatError: if an option is not valid.
-        DataError: if the shard or the number of jobs is not valid.
-        SceneError: if there is no scene, or the output folder holds other results.
+        DataError: if the number of jobs is not valid.
+        SceneError: if there is no scene, the output folder holds other results, or a page or picture that an earlier
+            call did not write is there.
 
     Example:
         >>> import tempfile
@@ -105,22 +117,35 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
-    trained = _loaded(refiner)
-    size = parse_resolution(resolution)
+    size, trained = parse_resolution(resolution), _loaded(refiner)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
-    compacting = _Compacting(request.prune, size, data, refiner, request.repair)
-    make: Callable[[Gaussians, Path], SmallerScene] = compacting
+    make = _Compacting(request.prune, size, data, target_format, refiner, request.repair, targets)
     options = {
-        **compacting.options(),
+        **make.options(),
         "refiner": None if trained is None else source_file(trained.source).sha256,
         "effort": effort if seconds is None else None,
         "seconds": seconds,
+        **({} if target_format is None else {"format": target_format}),
     }
     if targets is not None:
         options |= {"keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
-        make = functools.partial(_found, refiner, targets, request.prune.by, repairs_of(effort), size, data)
-    return run_on_folder(folder, target, Command("compact", make, options), jobs, shard, force, progress)
+    page, sheet = (None if path is None else Path(path) for path in (html, picture))
+    again = force or (target / FOLDER_FILES.scenes).exists()
+    for path, end in ((page, ".html"), (sheet, ".png")):
+        if path is not None:
+            need_suffix(path, end)
+            need_new(path, again)
+
+    def show(results: Sequence[SceneResult]) -> None:
+        if page is not None:
+            write_gallery(page, folder.resolve().name, results)
+        if sheet is not None:
+            write_sheet(sheet, results)
+
+    draw = functools.partial(_drawn, data) if page or sheet else None
+    command = Command("compact", make, options, target_format, draw)
+    return run_on_folder(folder, target, command, jobs, force, progress, show)
 
 
 def prune_folder(
@@ -130,14 +155,13 @@ def prune_folder(
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
     jobs: int = 1,
-    shard: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
     """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
-    pruning = _Pruning(request, parse_resolution(resolution), data)
+    pruning = _Pruning(request, parse_resolution(resolution), data, None)
     options = {**pruning.options(), "opacity_weight": request.opacity_weight}
-    return run_on_folder(folder, output, Command("prune", pruning, options), jobs, shard, force, progress)
+    return run_on_folder(folder, output, Command("prune", pruning, options), jobs, force, progress)
 
 
 def convert_folder(
@@ -151,7 +175,6 @@ def convert_folder(
     original_frame: bool = False,
     offset: Sequence[float] | Literal["centre"] | None = None,
     jobs: int = 1,
-    shard: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> list[SceneResult]:
@@ -164,7 +187,7 @@ def convert_folder(
         **({} if offset is None else {"offset": str(offset)}),
     }
     command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame, offset), options, suffix)
-    return run_on_folder(folder, output, command, jobs, shard, force, progress)
+    return run_on_folder(folder, output, command, jobs, force, progress)
 
 
 _loaded = functools.cache(refiner_at)
@@ -177,6 +200,8 @@ class _Pruning:
     request: PruneRequest
     resolution: tuple[int, int] | None
     data: str | Path | None
+    suffix: str | None
+    """Suffix of the results; None for the format of each scene."""
 
     def options(self) -> dict[str, str | float | bool | None]:
         """All options that a result depends on."""
@@ -191,35 +216,49 @@ class _Pruning:
         }
 
     def __call__(self, dense: Gaussians, path: Path) -> SmallerScene:
-        """Make one scene smaller. One that has fewer Gaussians than a count is kept whole."""
+        """Make one scene smaller."""
         source = view_source(dense, run=path, data=self.data, resolution=self.resolution)
-        request = replace(self.request, suffix=format_like(path).budget_suffix)
-        if isinstance(request.budget, int) and len(dense) < request.budget:
-            note, same = f"kept whole, with fewer Gaussians than --keep {request.budget}", request.sh == "all"
-            kept = dense if same else prune_scene(dense, replace(request, keep=1.0), source).scene
-            return SmallerScene(kept, None, note, same)
-        scene = self.smaller(dense, request, source)
-        return SmallerScene(scene, judge_of(dense, source), source.missing[2:-1])
+        kind = format_like(path) if self.suffix is None else format_to_write(self.suffix)
+        scene = self.smaller(dense, replace(self.request, suffix=kind.budget_suffix), source, path)
+        whole = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
+        whole = whole and all(map(torch.equal, scene.tensors(), dense.tensors()))
+        note = "kept whole" if whole else source.missing[2:-1]
+        judge = None if whole and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
+        return SmallerScene(scene, judge, note, same=whole and isinstance(self.request.budget, int))
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> Gaussians:
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource, path: Path) -> Gaussians:
         """The smaller scene."""
         return prune_scene(dense, request, source).scene
 
 
 @dataclass(frozen=True)
 class _Compacting(_Pruning):
-    """Compacts the scenes of a folder."""
+    """Compacts the scenes of a folder, or finds the cheapest version of each that meets targets."""
 
     refiner: str | Path | None
     """Loaded by each process."""
     repair: RepairBudget
+    targets: Targets | None
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource) -> Gaussians:
+    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource, path: Path) -> Gaussians:
         """The compact scene."""
-        result = compact_scene(dense, CompactRequest(request, _loaded(self.refiner), self.repair), source)
+        trained = _loaded(self.refiner)
+        if self.targets is None:
+            result = compact_scene(dense, CompactRequest(request, trained, self.repair), source)
+        else:
+            subject = subject_of(dense, path, None, trained, request.suffix, self.resolution, data=self.data)
+            result = find_scene(subject, self.targets, request.by, repairs_of(self.repair.effort), silent)
         if result.interrupted:
-            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the repair of one scene
+            raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         return result.scene
+
+
+def _drawn(data: str | Path | None, scene: Path, result: Path, picture: Path) -> None:
+    """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
+    before, after = read_scene(scene), read_scene(result)
+    after = after if after.offset is None else after.at_offset(before.offset)
+    with suppress(DataError):
+        draw_pair(before, after, view_source(before, run=scene, data=data).known(VIEW_COUNTS.opening), picture)
 
 
 def _converted(
@@ -234,22 +273,3 @@ def _converted(
     """One scene of a folder for another format."""
     cut = dense if sh == "all" else cut_sh(dense, int(sh))
     return SmallerScene(place(cut, up, scale, path if original_frame else None, offset))
-
-
-def _found(
-    refiner: str | Path | None,
-    targets: Targets,
-    by: str,
-    repairs: tuple[Repair, ...],
-    resolution: tuple[int, int] | None,
-    data: str | Path | None,
-    dense: Gaussians,
-    path: Path,
-) -> SmallerScene:
-    """Find the cheapest version of one scene of a folder that meets targets."""
-    suffix = format_like(path).suffix
-    subject = subject_of(dense, path, None, _loaded(refiner), suffix, resolution, data=data)
-    result = find_scene(subject, targets, by, repairs, silent)
-    if result.interrupted:
-        raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the search of one scene
-    return SmallerScene(result.scene, judge_of(dense, subject.new_views()))

@@ -13,7 +13,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pointsplat_ns.compression.quality import Judge, read_back
-from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import (
@@ -39,12 +38,17 @@ from pointsplat_ns.io.files import (
 )
 from pointsplat_ns.io.formats import format_like, format_to_read, format_to_write
 from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
+from pointsplat_ns.pages.gallery import pair_of
 from pointsplat_ns.system.claims import claim
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.workers import WorkerKilled, Workers, check_jobs
 
 Status = Literal["done", "done before", "failed", "open"]
 
+FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
+"""Numbers of a result in its record."""
+
+_Facts = Mapping[str, Any]
 CommandOptions = Mapping[str, str | float | bool | None]
 """The options that a result depends on."""
 
@@ -75,6 +79,8 @@ class SceneResult:
     """Gaussians of the scene."""
     after: int | None = None
     """Gaussians of the result."""
+    megabytes_before: float | None = None
+    """Size of the scene's file, 10^6 bytes."""
     megabytes: float | None = None
     """Size of the result, 10^6 bytes."""
     psnr: float | None = None
@@ -85,6 +91,9 @@ class SceneResult:
     """The error in one line; empty if there was none."""
     note: str = ""
     """A remark on the result; empty if there is none."""
+
+
+Show = Callable[[Sequence[SceneResult]], None]
 
 
 @dataclass(frozen=True)
@@ -112,6 +121,8 @@ class Command:
     """All options that ``make`` depends on."""
     suffix: str | None = None
     """Suffix of the results; None for the format of each scene."""
+    draw: Callable[[Path, Path, Path], None] | None = None
+    """Draws a scene and its result to a picture file, from their paths; None for no pictures."""
 
 
 @dataclass(frozen=True)
@@ -147,16 +158,20 @@ def run_on_folder(
     output: Path,
     command: Command,
     jobs: int = 1,
-    shard: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
+    show: Show | None = None,
 ) -> list[SceneResult]:
-    """Run a command on every scene of a folder, and write the results to another folder. Arguments, results and errors
-    are those of :func:`~pointsplat_ns.folders.compact_folder`."""
+    """Run a command on every scene of a folder, and write the results to another folder. ``show`` is called at the
+    end, also after an interruption. Other arguments, results and errors are those of
+    :func:`~pointsplat_ns.folders.compact_folder`."""
     check_jobs(jobs)
-    part = part_of(shard)
-    everything = _tasks(folder, output, command.suffix)
-    tasks = everything[part]
+    if os.path.realpath(folder) == os.path.realpath(output):
+        raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
+    tasks = [
+        SceneTask(scene.name, scene.path, output / f"{scene.name}{command.suffix or format_like(scene.path).suffix}")
+        for scene in find_scenes(folder)
+    ]
     _check_and_describe(output, command, force)
     results: dict[str, SceneResult] = {}
     try:
@@ -177,42 +192,14 @@ def run_on_folder(
         for task in tasks:
             if task.name not in results or results[task.name].status == "failed":
                 _clean(task)
-        _write_table(output, everything, results)
+        _write_table(output, tasks, results, show)
     return [results[task.name] for task in tasks]
-
-
-def part_of(shard: str | None) -> slice:
-    """The part of a list that a shard such as ``2/5`` names: every fifth item from the second on; all for None.
-
-    Raises:
-        DataError: if there is no such part.
-
-    Example:
-        >>> "abcdefg"[part_of("2/3")]
-        'be'
-    """
-    numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard or "1/1")
-    if numbers is None:
-        raise DataError(f"shard {shard!r}; expected which one of how many, such as 1/4")
-    index, count = int(numbers[1]), int(numbers[2])
-    if not 1 <= index <= count:
-        raise DataError(f"shard {shard}; expected 1/{count} to {count}/{count}")
-    return slice(index - 1, None, count)
 
 
 def output_folder(folder: Path, suffix: str) -> Path:
     """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
     place = Path(os.path.abspath(folder))
     return place.with_name(f"{place.name}_{suffix}")
-
-
-def _tasks(folder: Path, output: Path, suffix: str | None) -> list[SceneTask]:
-    if os.path.realpath(folder) == os.path.realpath(output):
-        raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
-    return [
-        SceneTask(scene.name, scene.path, output / f"{scene.name}{suffix or format_like(scene.path).suffix}")
-        for scene in find_scenes(folder)
-    ]
 
 
 def _check_and_describe(output: Path, command: Command, force: bool) -> None:
@@ -262,7 +249,8 @@ def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -
             shutil.rmtree(task.unfinished, ignore_errors=True)  # of a killed process
             for part in source_parts(task.source):
                 require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
-            text = json.dumps([source_file(task.source).sha256, dict(command.options)], sort_keys=True)
+            source = source_file(task.source)
+            text = json.dumps([source.sha256, dict(command.options)], sort_keys=True)
             key = hashlib.sha256(text.encode()).hexdigest()
             record = _read_record(task)
             whole = record is not None and task.output.is_file() and content_hash(task.output) == record["sha256"]
@@ -276,7 +264,10 @@ def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -
             else:
                 dense = read_scene(task.source)
                 made = command.make(dense, task.source)
-                result = _write(task, len(dense), made, {"key": key, "options": dict(command.options)}, start)
+                facts = {"before": len(dense), "megabytes_before": source.bytes / 1e6}
+                result = _write(task, facts, made, {"key": key, "options": dict(command.options)}, start)
+            if command.draw is not None and not pair_of(task.output).exists():
+                command.draw(task.source, task.output, pair_of(task.output))
             task.lock.unlink(missing_ok=True)  # the next process to get the lock finds the scene finished
             return result
     except Exception as error:  # one scene must not stop the others
@@ -286,7 +277,7 @@ def _make_result(command: Command, force: bool, given: tuple[SceneTask, bool]) -
         return task.result("failed", seconds=time.perf_counter() - start, error=error_text)
 
 
-def _write(task: SceneTask, before: int, made: SmallerScene, proofs: Mapping[str, Any], start: float) -> SceneResult:
+def _write(task: SceneTask, known: _Facts, made: SmallerScene, proofs: _Facts, start: float) -> SceneResult:
     """Write a result and its record. A process killed in between leaves the record alone: the scene is unfinished."""
     kind, unfinished = format_to_write(task.output), task.unfinished
     unfinished.mkdir()
@@ -298,14 +289,15 @@ def _write(task: SceneTask, before: int, made: SmallerScene, proofs: Mapping[str
         psnr = math.inf if made.judge is None else made.judge.psnr(read_back(made.scene, part, kind))[0]
         done = task.result(
             "done",
-            before=before,
+            **known,
             after=len(made.scene),
             megabytes=part.stat().st_size / 1e6,
             psnr=psnr if math.isfinite(psnr) else None,
             seconds=time.perf_counter() - start,
             note=made.note,
         )
-        task.output.unlink(missing_ok=True)  # an old scene must not stand beside the new record
+        for old in (task.output, pair_of(task.output)):  # must not stand beside the new record
+            old.unlink(missing_ok=True)
         facts = {name: value for name, value in dataclasses.asdict(done).items() if name not in ("name", "output")}
         with replacing(task.record, folder=unfinished, named=False) as record:
             record.write_text(json_text({**facts, **proofs, "sha256": content_hash(part)}) + "\n", encoding="utf-8")
@@ -332,24 +324,27 @@ def _read_record(task: SceneTask) -> dict[str, Any] | None:
     if not isinstance(record, dict):
         return None
     texts = all(isinstance(record.get(name), str) for name in ("key", "sha256", "note"))
-    figures = [record.get(name) for name in ("before", "after", "megabytes", "psnr", "seconds")]
+    figures = [record.get(name) for name in FIGURES]
     numbers = all(value is None or (isinstance(value, (int, float)) and abs(value) < 1e18) for value in figures)
     return record if texts and numbers else None
 
 
 def _result_in(task: SceneTask, record: Mapping[str, Any]) -> SceneResult:
     """The result in a record."""
-    names = ("before", "after", "megabytes", "psnr", "seconds", "note")
-    return task.result("done before", **{name: record.get(name) for name in names})
+    return task.result("done before", **{name: record.get(name) for name in (*FIGURES, "note")})
 
 
-def _write_table(output: Path, everything: Sequence[SceneTask], results: Mapping[str, SceneResult]) -> None:
-    """Write the table of all scenes. Scenes of other shards are taken from their records."""
+def _write_table(
+    output: Path, tasks: Sequence[SceneTask], results: Mapping[str, SceneResult], show: Show | None
+) -> None:
+    """Write the table of all scenes, and show them. Results that an interruption left out come from their records."""
 
     def row(task: SceneTask) -> SceneResult:
         record = _read_record(task)
         return task.result("open") if record is None else _result_in(task, record)
 
     with claim(output / FOLDER_FILES.scenes_lock, wait=True):  # so the last process to write has read all records
-        rows = [dataclasses.asdict(results.get(task.name) or row(task)) for task in everything]
-        write_csv(rows, output / FOLDER_FILES.scenes_table)
+        rows = [results.get(task.name) or row(task) for task in tasks]
+        write_csv([dataclasses.asdict(row) for row in rows], output / FOLDER_FILES.scenes_table)
+        if show is not None:
+            show(rows)

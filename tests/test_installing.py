@@ -18,9 +18,9 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import pointsplat_ns as ps
+from lab import demo
 from making import REPOSITORY, imports_of
-from pointsplat_ns.cli import demo, main
-from pointsplat_ns.cli.scene_options import claims_until_the_end
+from pointsplat_ns.cli import main
 from pointsplat_ns.errors import MissingPackageError, need
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 
@@ -175,7 +175,7 @@ def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(no_nerfstud
     made = []
     monkeypatch.setattr(demo, "compact_example", lambda *_: made.append("example") or [])
     missing = "the rest of the demo, which trains, needs nerfstudio, which is not"
-    with pytest.raises(MissingPackageError, match=missing), claims_until_the_end():
+    with pytest.raises(MissingPackageError, match=missing):
         demo.demo(tmp_path)
     assert made == ["example"]
 

@@ -11,9 +11,11 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
+from pointsplat_ns.cli.goals import GOALS, GoalName, file_for, print_next, print_use
 from pointsplat_ns.cli.printing import (
     end_if_interrupted,
     print_details,
+    print_if_larger,
     print_json,
     print_result,
     scene_result,
@@ -48,6 +50,7 @@ Photos = Annotated[
 def compact(
     scene: options.Scenes,
     output: options.Output = None,
+    goal: Annotated[GoalName | None, tyro.conf.arg(name="for")] = None,
     keep: str | None = None,
     refiner: Annotated[Path | None, tyro.conf.arg(aliases=["--using"])] = None,
     by: str | None = None,
@@ -65,11 +68,9 @@ def compact(
     data: options.Data = None,
     picture: Path | None = None,
     html: Path | None = None,
-    html_limit: options.Megabytes = 60.0,
     dry_run: bool = False,
     force: options.Force = False,
     jobs: options.Jobs = None,
-    shard: options.Shard = None,
     threads: options.Threads = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
@@ -86,9 +87,12 @@ def compact(
     after an interruption. It may also run several times at once, or on several machines that share the folder.
 
     Args:
-        output: the file to write, of any format as for prune; by default beside the scene: room_compact.ply for
-            room.ply, compact.ply in the folder of a run. For a folder of scenes, another folder; by default
-            rooms_compact beside rooms. Each result there has the format of its scene.
+        output: the file to write, of any format as for prune; by default in the format of the scene and beside
+            it: room_compact.ply for room.ply, compact.ply in the folder of a run. For a folder of scenes, another
+            folder; by default rooms_compact beside rooms. Each result there has the format of its scene.
+        goal: the purpose, in place of --keep and the format: web (a .sog of 2 MB, and a page with the scene to paste
+            into another), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of at most 400,000), email (an
+            .spz of 5 MB, and a page that opens with a double click). --keep, targets and --html replace its parts.
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
             default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
@@ -108,11 +112,10 @@ def compact(
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
             within the limits.
         target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
-        picture: a .png file for images of some views: dense, before and after the repair, side by side; by default
-            none.
+        picture: a .png file for images of some views: dense, before and after the repair, side by side; for a
+            folder, all scenes before and after; by default none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
-            between them; by default none.
-        html_limit: largest size of that file, MB. If both scenes take more, the dense one is left out.
+            between them; for a folder, a gallery of all scenes before and after; by default none.
         dry_run: compute and print everything, but write no scene.
     """
     options.need_scenes(scene)
@@ -120,31 +123,34 @@ def compact(
     from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
 
+    chosen, targeted = GOALS[goal], (target_db, target_ms, target_mb) != (None, None, None)
+    unasked = goal is None and keep is None and refiner is None and not targeted
+    keep = chosen.keep if keep is None and not targeted else keep
     if is_folder_of_scenes(scene):
         from pointsplat_ns.scene_folder import output_folder
 
-        one = {"--poses": poses, "--up": up, "--picture": picture, "--html": html, "--photos": photos}
-        one |= {"--dry-run": dry_run}
+        one = {"--poses": poses, "--up": up, "--photos": photos, "--dry-run": dry_run}
         return folder_command(
             ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
             keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
             target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, data=data,
-            shard=shard, force=force,
+            target_format=chosen.suffix, html=html, picture=picture, force=force,
         )  # fmt: skip
-    options.need_no_folder_options(scene, jobs, shard)
+    options.need_no_jobs(scene, jobs)
     from pointsplat_ns.compacting import Looking, compact_source
     from pointsplat_ns.compression.quality import quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.pages.scene_page import check_limit
+    from pointsplat_ns.io.runs import name_of
     from pointsplat_ns.tradeoff.search import targets_of
 
     options.check_poses(poses)
-    output = output or options.output_beside(scene, "compact")
+    output = file_for(goal, scene, output)
     written = None if dry_run else output
+    alone = chosen.page and html is None and not dry_run
+    html = output.with_suffix(".html") if alone else html
     options.claim_outputs(written, force, picture, html)
-    check_limit(html_limit)
     kind = format_to_write(output)
     request = CompactRequest.of(
         refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
@@ -162,7 +168,7 @@ def compact(
         files = [_file_text(scene), "not written" if written is None else _file_text(written)]
         shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
         if html is not None:
-            _write_page(scene, dense, result, files, html, html_limit, up, quality)
+            _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
     if json_output:
         made = {
             "refined": result.accepted,
@@ -176,13 +182,15 @@ def compact(
     also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
     also += ["trained on photos"] * (result.last.photos is not None)
     print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
+    print_if_larger(scene, written)
     if verbose:
         print_details(quality, dense, result.scene)
     if shown is not None:
         print(shown)
-    if html is not None:
-        print(f"{html}: {written_size(html)}, to fly through in a browser")
+    print_use(goal, html, name_of(scene), quality)
     end_if_interrupted(result.interrupted)
+    if unasked and written is not None:
+        print_next(scene, written, quality)
 
 
 def _file_text(path: Path) -> str:
@@ -196,22 +204,23 @@ def _file_text(path: Path) -> str:
 
 def _write_page(
     scene: Path,
-    dense: Gaussians,
+    shown: list[Gaussians],
     result: Compacted,
     files: list[str],
     html: Path,
-    limit_mb: float,
     up: str | None,
     quality: Quality | None,
+    limit_mb: float,
 ) -> None:
-    """The page to fly through the scene before and after."""
+    """The page to fly through the result alone, or the scene before and after."""
     import pointsplat_ns as ps
     from pointsplat_ns.io.runs import name_of
 
-    names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)]
-    notes = [] if quality is None else [f"{quality}"]
+    both = len(shown) > 1
+    names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)] if both else None
+    notes = [f"{quality}"] if both and quality is not None else []
     sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
     ps.write_page(
-        [dense, result.scene], html, names, title=name_of(scene), notes=notes,
-        views=None if sampled else result.views, up=up, limit_mb=limit_mb, progress=True,
+        shown, html, names, title=name_of(scene), notes=notes, views=None if sampled else result.views, up=up,
+        limit_mb=limit_mb, progress=True,
     )  # fmt: skip

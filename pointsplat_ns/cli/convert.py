@@ -30,7 +30,6 @@ def convert(
     to: str | None = None,
     force: options.Force = False,
     jobs: options.Jobs = None,
-    shard: options.Shard = None,
     json_output: options.Json = False,
 ) -> None:
     """Write a scene in another format, or all scenes of a folder. What formats lose stands in docs/formats.md.
@@ -73,9 +72,9 @@ def convert(
         one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
         return folder_command(
             convert_folder, scene, output, one, json_output, jobs,
-            suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, offset=point, shard=shard, force=force,
+            suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, offset=point, force=force,
         )  # fmt: skip
-    options.need_no_folder_options(scene, jobs, shard)
+    options.need_no_jobs(scene, jobs)
     if to is not None:
         raise ps.SceneError(f"{scene}: one scene; --to is for a folder of scenes, the name of {output} says its format")
     options.claim_outputs(output, force)

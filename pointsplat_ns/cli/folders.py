@@ -55,6 +55,8 @@ def folder_command(
     else:
         _print_table(results)
         print(f"{output}: {len(results) - failed} of {len(results)} scenes, and the table {FOLDER_FILES.scenes_table}")
+        for shown in filter(None, (options.get("html"), options.get("picture"))):
+            print(f"{shown}: all scenes before and after")
     if failed:
         raise ps.PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
 

@@ -13,9 +13,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "compact": (
         ("a tenth, repaired, and a page to compare", "pointsplat compact room.ply --keep 10% --html small.html"),
+        ("for a page of the web", "pointsplat compact room.ply --for web"),
         ("the smallest file of at least 32 dB", "pointsplat compact room.ply --target-db 32 -o small.sog"),
         ("with the photos and their COLMAP model", "pointsplat compact room.ply --photos images --poses sparse/0"),
-        ("every scene of a folder, four at a time", "pointsplat compact rooms --keep 10% --jobs 4"),
+        ("every scene of a folder, and a gallery", "pointsplat compact rooms --keep 10% --jobs 4 --html all.html"),
     ),
     "lod": (
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
@@ -54,8 +55,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("sooner: fewer pixels, fewer steps", "pointsplat train my_capture --keep 50k --scale 0.5 --steps 3000"),
     ),
     "demo": (
-        ("a scene to try commands with: room.ply", "pointsplat demo --scene-only"),
-        ("in a folder of its own", "pointsplat demo --output outputs/try"),
+        ("a scene to try commands with: room.ply", "pointsplat demo"),
+        ("in another format", "pointsplat demo -o room.spz"),
     ),
 }
 """Command lines of every command, with the purpose of each."""

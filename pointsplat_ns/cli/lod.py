@@ -67,7 +67,7 @@ def lod(
 
     options.need_one_scene(scene)
     options.check_poses(poses)
-    folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod").with_suffix("")
+    folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod", "")
     for_viewers = stream or tiles or folder.suffix.lower() == ".rad"
     with fixed_threads(threads):
         made = ps.lod(

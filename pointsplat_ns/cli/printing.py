@@ -89,6 +89,13 @@ def print_result(
     print(quality or "not compared with the dense scene: nothing of it is visible")
 
 
+def print_if_larger(scene: Path, where: Path | None) -> None:
+    """Print a note if a result takes more bytes than the scene's file, whose format has fewer for each Gaussian."""
+    if where is not None and scene.is_file() and scene.suffix != ".yml" and file_bytes(scene) < file_bytes(where):
+        remedy = "" if scene.suffix == where.suffix else f"; a name that ends in {scene.suffix} makes it smaller"
+        print(f"note: {where} is larger than {scene}: {written_size(where)}, not {written_size(scene)}{remedy}")
+
+
 def psnr_text(psnr: float | None) -> str:
     """A PSNR in a table, dB: ``same`` where nothing differs, and a dash where nothing was compared."""
     from pointsplat_ns.compression.quality import MOST_SAID

@@ -8,6 +8,7 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
     print_details,
+    print_if_larger,
     print_json,
     print_result,
     scene_result,
@@ -30,7 +31,6 @@ def prune(
     dry_run: bool = False,
     force: options.Force = False,
     jobs: options.Jobs = None,
-    shard: options.Shard = None,
     memory: options.Megabytes | None = None,
     threads: options.Threads = None,
     verbose: options.Verbose = False,
@@ -44,8 +44,9 @@ def prune(
 
     Args:
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
-            default beside the scene: room_pruned.ply for room.ply, pruned.ply in the folder of a run. For a folder of
-            scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format of its scene.
+            default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in a run's folder. For
+            a folder of scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format
+            of its scene.
         keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of the file (12MB
             or 800kB; for .spz and .sog the count is searched for, which takes two or three times as long), or auto:35,
             the smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
@@ -82,10 +83,9 @@ def prune(
         one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
-            request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data, shard=shard,
+            request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data,
             force=force,
         )  # fmt: skip
-    options.need_no_folder_options(scene, None, shard)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "pruned")
     written = None if dry_run else output
@@ -98,7 +98,7 @@ def prune(
     small: ps.Gaussians | PlyRows | None
     with fixed_threads(threads):
         if rows is None:
-            options.need_no_folder_options(scene, jobs, shard)
+            options.need_no_jobs(scene, jobs)
             looking = Looking(poses, resolution, up, data)
             dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
             small, before = pruned, len(dense)
@@ -124,6 +124,7 @@ def prune(
         return
     unknown = "not compared with the dense scene: it does not fit into memory"
     print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
+    print_if_larger(scene, written)
     if verbose and dense is not None and isinstance(small, ps.Gaussians):
         print_details(quality, dense, small)
     if plot is not None:

@@ -75,5 +75,5 @@ def _beside(scene: Path) -> Path:
     """The default video: beside a file, in the folder of a run."""
     from pointsplat_ns.cli.scene_options import output_beside
 
-    beside = output_beside(scene, "render")
-    return beside.with_name(f"{scene.stem}.mp4" if beside.stem.endswith("_render") else "render.mp4")
+    beside = output_beside(scene, "render", ".mp4")
+    return beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4")

@@ -58,10 +58,6 @@ Jobs = Annotated[
         "and the cores; by default 1."
     ),
 ]
-Shard = Annotated[
-    str | None,
-    tyro.conf.arg(help="for a folder: only a part of its scenes; 2/5 is the second of five; by default all."),
-]
 Threads = Annotated[
     int | None,
     tyro.conf.arg(
@@ -78,17 +74,20 @@ Json = Annotated[
 ]
 
 
-def output_beside(scene: Path, suffix: str) -> Path:
-    """The default path of the result. For a file, a path beside it: ``room_pruned.ply`` for ``room.ply``. For a run, a
-    path in its folder: ``pruned.ply``; never in its checkpoint folder, because nerfstudio takes every file there for a
-    checkpoint."""
+def output_beside(scene: Path, what: str, suffix: str | None = None) -> Path:
+    """The default path of a result, by default in the format of the scene's file. For a file, it is beside it:
+    ``room_pruned.ply`` for ``room.ply``. For a run, it is in its folder: ``pruned.ply``; never in its checkpoint
+    folder, because nerfstudio takes every file there for a checkpoint."""
+    from pointsplat_ns.io.formats import format_like
+
+    name = f"{what}{format_like(scene).suffix if suffix is None else suffix}"
     if scene.is_dir():
-        return scene / f"{suffix}.ply"
+        return scene / name
     if scene.absolute().parent.name == "nerfstudio_models":
-        return scene.absolute().parents[1] / f"{suffix}.ply"
+        return scene.absolute().parents[1] / name
     if scene.suffix.lower() in (".yml", ".yaml"):
-        return scene.with_name(f"{suffix}.ply")
-    return scene.with_name(f"{scene.stem}_{suffix}.ply")
+        return scene.with_name(name)
+    return scene.with_name(f"{scene.stem.removesuffix('.compressed')}_{name}")
 
 
 def need_scenes(*paths: Path | None) -> None:
@@ -108,12 +107,12 @@ def need_scenes(*paths: Path | None) -> None:
         raise SceneError(f"{', '.join(gone)}: {what}; expected a scene: {ONE_SCENE}")
 
 
-def need_no_folder_options(scene: Path, jobs: int | None, shard: str | None) -> None:
-    """Raise a SceneError if options are given that are for a folder of scenes."""
+def need_no_jobs(scene: Path, jobs: int | None) -> None:
+    """Raise a SceneError if a number of processes is given, which is for a folder of scenes."""
     from pointsplat_ns.errors import SceneError
 
-    if jobs is not None or shard is not None:
-        raise SceneError(f"{scene}: one scene; --jobs and --shard are for a folder of scenes")
+    if jobs is not None:
+        raise SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
 
 
 def need_one_scene(path: Path) -> None:
@@ -146,19 +145,17 @@ def claim_outputs(scene: Path | None, force: bool, png: Path | None = None, html
     """Check and hold the files that a command is going to write (a scene of any writable format, a picture, a page),
     before its long computations and until it ends. Raises SceneError if a path has another suffix, or as
     :func:`~pointsplat_ns.io.outputs.claimed`."""
-    from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.formats import format_to_write
+    from pointsplat_ns.io.outputs import need_suffix
 
     files = []
     if scene is not None:
         format_to_write(scene)
         files += [scene.with_name(name) for name in _file_names(scene)]
     for path, kind in ((png, ".png"), (html, ".html")):
-        if path is not None and path.suffix.lower() != kind:
-            raise SceneError(
-                f"{path}: cannot write a {path.suffix or 'nameless'} file; expected a name that ends in {kind}"
-            )
-        files += [] if path is None else [path]
+        if path is not None:
+            need_suffix(path, kind)
+            files.append(path)
     for file in files:
         claim_file(file, force)
 

@@ -64,7 +64,7 @@ def tradeoff(
     from pointsplat_ns.tradeoff.recommend import next_best
 
     options.check_poses(poses)
-    folder = output or options.output_beside(scene, "tradeoff").with_suffix("")
+    folder = output or options.output_beside(scene, "tradeoff", "")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, keep=keep, within=within, by=by, sh=sh, repairs=repairs, views=views, poses=poses,

@@ -42,6 +42,10 @@ class FolderFiles:
 FOLDER_FILES = FolderFiles()
 
 
+RESULT_ENDS = ("_pruned", "_compact", "_web", "_phone", "_headset", "_email")
+"""Ends of the names that commands give their results beside a scene."""
+
+
 @dataclass(frozen=True)
 class FoundScene:
     """A scene below a folder."""
@@ -64,7 +68,7 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
     files = _files_with_gaussians(folder, is_scene_file)
     stems = {_stem(path) for path in files}
     for path in tuple(files):
-        sources = {_stem(path).removesuffix(end) for end in ("_pruned", "_compact")} - {_stem(path)}
+        sources = {_stem(path).removesuffix(end) for end in RESULT_ENDS} - {_stem(path)}
         if sources & stems:
             logger.warning("passed over %s: a result of %s", path, *sources)
             files.remove(path)

@@ -14,6 +14,19 @@ LOCK_NAME = ".pointsplat.lock"
 """Lock file in a claimed folder."""
 
 
+def need_suffix(path: Path, suffix: str) -> None:
+    """Raise a SceneError if a path does not end in a suffix, such as ``.png``."""
+    if path.suffix.lower() != suffix:
+        what = f"a {path.suffix or 'nameless'} file"
+        raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {suffix}")
+
+
+def need_new(path: Path, force: bool) -> None:
+    """Raise a SceneError if a path exists and may not be replaced."""
+    if target_of(path).exists() and not force:
+        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+
+
 @contextmanager
 def claimed(path: Path, force: bool = False) -> Iterator[None]:
     """Hold a file that will be written, so that another process that claims it fails at once.
@@ -34,8 +47,7 @@ def claimed(path: Path, force: bool = False) -> Iterator[None]:
         try:
             target = target_of(path)
             stack.enter_context(_locked(target.with_name(f".{name}.lock"), path))
-            if target_of(path).exists() and not force:
-                raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+            need_new(path, force)
         except OSError as error:
             raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
         if not force:

@@ -75,7 +75,8 @@ def write_page(
         raise PointSplatError(f"{len(scenes)} scenes for {path}; expected one or two")
     if len(names) != len(scenes):
         raise PointSplatError(f"{len(names)} names for {len(scenes)} scenes; expected one for each")
-    check_limit(limit_mb)
+    if not limit_mb > 0:
+        raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
     upward = up_named(up)
     scenes = [scene.at_offset(scenes[0].offset) for scene in scenes]
     for scene in scenes:
@@ -100,12 +101,6 @@ def write_page(
     with replacing(path) as part:
         part.write_bytes(text)
     return path
-
-
-def check_limit(limit_mb: float) -> None:
-    """Raise a PointSplatError, before the long computations, if the limit is not above 0."""
-    if not limit_mb > 0:
-        raise PointSplatError(f"a page of at most {limit_mb:g} MB; expected a number above 0")
 
 
 def _html(flight: dict[str, Any], title: str, notes: Sequence[str], missing: str) -> bytes:

@@ -78,12 +78,12 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
-    Gaussian. A ratio gives the nearest count (a half is rounded up), and at least one. A size gives as many Gaussians
-    as fit into the file.
+    Gaussian. A ratio gives the nearest count (a half is rounded up), and at least one. A count above ``n`` keeps all.
+    A size gives as many Gaussians as fit into the file.
 
     Args:
         n: number of Gaussians in the scene.
-        keep: float ratio in (0, 1], int count in 1..n, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
+        keep: float ratio in (0, 1], int count from 1 on, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
             it.
         sh_degree: SH degree of the scene that will be written; only a size depends on it.
         traits: of the scene; only a size depends on them.
@@ -98,8 +98,8 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
     Example:
         >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0), resolve_keep(1000, "25%")
         (300, 1, 1000, 250)
-        >>> resolve_keep(1000, Megabytes(0.1), sh_degree=0)
-        1000
+        >>> resolve_keep(1000, 2000), resolve_keep(1000, Megabytes(0.1), sh_degree=0)
+        (1000, 1000)
     """
     if isinstance(keep, str):
         keep = parse_keep(keep)
@@ -112,14 +112,14 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
     if isinstance(keep, Megabytes):
         return _count_that_fits(n, keep, sh_degree, traits)
     if isinstance(keep, Integral):
-        if not 1 <= keep <= n:
-            raise BudgetError(f"keep is {int(keep)} Gaussians; expected 1 to {n}, the number in the scene")
+        if keep < 1:
+            raise BudgetError(f"keep is {int(keep)} Gaussians; expected at least 1")
         if isinstance(keep, BareCount) and keep < 100 and n >= 5000:
             raise BudgetError(
                 f"keep is {int(keep)}, of {n:,} Gaussians; did you mean {int(keep)}%? Write {int(keep)}gaussians for "
                 "so few"
             )
-        return int(keep)
+        return min(int(keep), n)
     if not 0 < keep <= 1:  # NaN fails too
         raise BudgetError(f"keep is {float(keep)!r}; {KEEP_FORMS}")
     return min(n, max(1, int(n * float(keep) + 0.5)))

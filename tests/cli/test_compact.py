@@ -1,6 +1,8 @@
 """pointsplat compact: what it writes and says, and what it refuses."""
 
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -11,11 +13,14 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import acceptance, pictures, trained_refiner
+from pointsplat_ns.cli.goals import GOALS
+from pointsplat_ns.compression import acceptance, pictures, quality, trained_refiner
 from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.io.scene import save
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import METHODS, prune
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
@@ -100,10 +105,68 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     assert titles[0].splitlines()[2:] == files[:1]
     assert titles[-1].splitlines()[2:] == [files[1], *quality.split(": ")]
     assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
-    limit = str(shown.stat().st_size / 1e6 - 0.0005)  # a little too small for both
-    run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--html-limit", limit, "--force")
-    assert " is left out: " in shown.read_text("utf-8")
-    assert [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]] == ["compact (not written)"]
+    run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--force")
+    names = [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]]
+    assert names == [f"dense ({files[0]})", "compact (not written)"]
+
+
+@pytest.mark.parametrize("goal", [name for name in GOALS if name])
+def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, capsys):
+    """The budget is an upper bound, so this scene is whole; its page has it alone. Options replace the goal's parts."""
+    monkeypatch.chdir(tmp_path)
+    write_ply(room(), "my room.ply")
+    wanted, file, page = GOALS[goal], Path(f"my room_{goal}{GOALS[goal].suffix}"), Path(f"my room_{goal}.html")
+    run("compact", "my room.ply", "--for", goal)
+    said = capsys.readouterr().out
+    assert "all 150 Gaussians fit as they are" in said and len(read_scene(file)) == 150
+    assert page.exists() == wanted.page and ("smaller --keep lowers it" in said) == (goal == "headset")
+    if wanted.page:
+        [shown] = parts_of(page).data["flight"]["scenes"]
+        assert (shown["name"], shown["amount"]) == ("my-room", "150 Gaussians")
+        assert f"{page}: {bytes_text(page.stat().st_size)}, to " in said
+    assert ('<iframe src="my%20room_web.html" title="my-room"' in said) == (goal == "web")
+    assert [scene.name for scene in find_scenes(tmp_path)] == ["my room"]
+    run(
+        "compact",
+        "my room.ply",
+        "--for",
+        goal,
+        "--keep",
+        "50%",
+        "--html",
+        "both.html",
+        "--effort",
+        "instant",
+        "--force",
+    )
+    assert len(read_scene(file)) == 75 and len(parts_of(Path("both.html")).data["flight"]["scenes"]) == 2
+    capsys.readouterr()
+    refused = refusal(capsys, tmp_path / "small.ply", "my room.ply", "--for", goal)
+    assert (
+        f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place of --for" in refused
+    )
+
+
+@pytest.mark.parametrize(
+    ("psnr", "other"),
+    [
+        (20.0, "compact 'a room.spz' --keep 30% -o 'a room_30.spz'"),
+        (30.0, "compact 'a room.spz' --for web"),
+        (40.0, "compact 'a room.spz' --keep 3% -o 'a room_3.spz'"),
+    ],
+)
+def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypatch, capsys):
+    """Both work as they are printed; the result has the format of the scene."""
+    monkeypatch.chdir(tmp_path)
+    save(room(), "a room.spz")
+    measured = quality.quality_of_file
+    monkeypatch.setattr(quality, "quality_of_file", lambda *given: replace(measured(*given), psnr=psnr))
+    run("compact", "a room.spz")
+    *_, first, second = capsys.readouterr().out.splitlines()
+    assert first == "next: pointsplat view 'a room.spz' 'a room_compact.spz'"
+    assert second == f"      pointsplat {other}" and len(read_scene("a room_compact.spz")) == 15
+    run(*shlex.split(other), "--effort", "instant")
+    assert "next: " not in capsys.readouterr().out
 
 
 def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):
@@ -158,7 +221,6 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
         (ply, ("--by", "best"), f"expected one of {', '.join(METHODS)}"),
         (ply, ("--picture", shown.with_suffix(".jpg")), "ends in .png"),
         (ply, ("--html", shown.with_suffix(".png")), "ends in .html"),
-        (ply, ("--html", shown.with_suffix(".html"), "--html-limit", "0"), "a page of at most 0 MB"),
     ):
         assert wanted in refusal(capsys, output, scene, *options), options
     assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply)

@@ -7,11 +7,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import pointsplat_ns as ps
+from html_parts import parts_of
 from making import ball, same
+from pointsplat_ns import folders
 from pointsplat_ns.cli import main
 from pointsplat_ns.io.formats import format_like, format_to_read
 from pointsplat_ns.system.claims import claim
@@ -85,7 +90,7 @@ def test_a_scene_with_fewer_gaussians_than_asked_for_is_kept_whole_and_the_table
     ps.save(ball(300, opacity=1.0, bright=1.0), tmp_path / "scenes" / "many.ply")
     run("compact", tmp_path / "scenes", "-o", tmp_path / "small", "--keep", "150", "--effort", "instant", "--sh", sh)
     said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "few 121 121" in said and "kept whole" in said and "many 300 150" in said
+    assert "few 121 121" in said and ("kept whole" in said) == (sh == "all") and "many 300 150" in said
     copied = (tmp_path / "small" / "few.sog").read_bytes() == (tmp_path / "scenes" / "few.sog").read_bytes()
     assert copied == (sh == "all") and len(ps.load(tmp_path / "small" / "few.sog")) == 121
 
@@ -115,9 +120,8 @@ def test_prune_and_convert_take_a_folder_and_go_on_where_they_were(folder, tmp_p
     [
         (("compact", "rooms", "--poses", "a.json"), "--poses is for one scene; rooms is a folder of scenes"),
         (("compact", "rooms", "--dry-run"), "--dry-run is for one scene"),
-        (("compact", "rooms", "--shard", "3/2"), "shard 3/2; expected 1/2 to 2/2"),
         (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
-        (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs and --shard are for a folder"),
+        (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),
         (("convert", "rooms", "out"), "rooms: a folder of scenes; expected their new format, such as --to .spz"),
         (("convert", "rooms", "out", "--to", "spz"), "spz: no suffix of scene files that are written"),
@@ -135,6 +139,56 @@ def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, 
     error = capsys.readouterr().err
     assert end.value.code == 1 and error.startswith("error: ") and error.count("\n") == 1 and said in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "rooms"]
+
+
+def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path, monkeypatch, capsys):
+    """Also after an interruption, from what is finished; the same command completes it."""
+    scenes, page, sheet = tmp_path / "my scenes", tmp_path / "shown" / "all.html", tmp_path / "all.png"
+    for name in ("a <b>.ply", "deep/c.spz", "later.ply"):
+        ps.save(ps.load(folder / "room1.ply"), scenes / name)
+    (scenes / "bad.ply").write_bytes((scenes / "later.ply").read_bytes()[:-9])
+    words = ("compact", scenes, "-o", tmp_path / "small", *OPTIONS, "--html", page, "--picture", sheet)
+    compact_scene = folders.compact_scene
+
+    def interrupted(dense, *given):
+        if (tmp_path / "small" / "deep" / "c.spz").exists():
+            raise KeyboardInterrupt
+        return compact_scene(dense, *given)
+
+    monkeypatch.setattr(folders, "compact_scene", interrupted)
+    with pytest.raises(SystemExit) as end:
+        run(*words)
+    assert end.value.code == 130
+    first = page.read_text("utf-8")
+    assert "2 of 4 scenes" in first and "not finished" in first and "later.ply" not in first.replace("later</h2>", "")
+    monkeypatch.setattr(folders, "compact_scene", compact_scene)
+    with pytest.raises(SystemExit):
+        run(*words)
+    said = capsys.readouterr().out
+    assert said.endswith(f"scenes.csv\n{page}: all scenes before and after\n{sheet}: all scenes before and after\n")
+    text, parts = page.read_text("utf-8"), parts_of(page)
+    assert "3 of 4 scenes" in text and "not finished" not in text and "bad.ply: truncated" in text
+    links = [a["href"] for tag, a in parts.elements if tag == "a"]
+    assert links == ["../small/a%20%3Cb%3E.ply", "../small/deep/c.spz", "../small/later.ply"]
+    assert all((page.parent / unquote(link)).is_file() for link in links) and "<h2>a &lt;b&gt;</h2>" in text
+    pictures = [a["src"] for tag, a in parts.elements if tag == "img"]
+    assert len(pictures) == 6 and all(picture.startswith("data:image/webp;base64,") for picture in pictures)
+    assert text.count(">121 Gaussians, ") == 3 and text.count(">61 Gaussians, ") == 3
+    with Image.open(sheet) as picture:
+        assert picture.size == (1280, 1200)
+        before, after = (np.asarray(picture.crop((x, 400, x + 640, 800)).resize((64, 40)), float) for x in (0, 640))
+    assert before.std() > 20 and 0 < abs(before - after).mean() < 60, "the same view of another scene"
+    page.unlink()
+    (tmp_path / "small" / "pointsplat-scenes.json").unlink()
+    with pytest.raises(SystemExit):
+        run(*words)
+    assert "all.png: exists already" in capsys.readouterr().err, "it may be a picture of the user's"
+
+
+def test_a_goal_is_that_of_each_scene_of_a_folder(folder, tmp_path):
+    run("compact", folder, "-o", tmp_path / "small", "--for", "web")
+    made = sorted(path.name for path in (tmp_path / "small").glob("room*"))
+    assert made == ["room1.sog", "room1.sog.json", "room2.sog", "room2.sog.json"]
 
 
 INTERRUPTED = """

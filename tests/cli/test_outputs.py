@@ -31,7 +31,6 @@ FOLDERS = (
     "lod damaged.ply -o OUT",
     "tradeoff damaged.ply -o OUT",
     "render damaged.ply -o OUT",
-    "demo --output OUT",
 )
 """Commands that fail at their work, because the scene is damaged, unless they find before that they cannot write."""
 
@@ -105,7 +104,7 @@ def test_a_file_that_appears_during_the_work_is_replaced_by_force_alone(links, m
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("compact room.ply --effort instant --html page.html --html-limit 0.001", "page.html: the page would have"),
+        ("compact room.ply --effort instant --html page.html", "shown.png: cannot be written (no reason)"),
         ("compact room.ply --effort instant --picture shown.png", "shown.png: cannot be written (no reason)"),
         ("prune room.ply --by opacity --plot shown.png", "shown.png: cannot be written (no reason)"),
     ],
@@ -117,6 +116,7 @@ def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words
 
     monkeypatch.setattr(ps, "plot_comparison", failing)
     monkeypatch.setattr(ps, "plot_distributions", failing)
+    monkeypatch.setattr(ps, "write_page", failing)
     ps.save(ball(40, opacity=1.0, bright=1.0), "room.ply")
     said = refusal(capsys, words + " -o small.ply --keep 50%" + " --dry-run" * dry).splitlines()[-1]
     assert said.startswith(f"error: {reason}") and Path("small.ply").exists() != dry

@@ -81,6 +81,17 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
 
 
+@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
+def test_a_small_scene_stays_in_its_format_or_its_growth_is_said(suffix, ply, tmp_path, capsys):
+    scene = tmp_path / f"small{suffix}"
+    ps.save(read_ply(ply), scene)
+    run("prune", scene, "--keep", "50%", "--by", "opacity")
+    assert "note" not in capsys.readouterr().out
+    assert len(read_scene(tmp_path / f"small_pruned{suffix}")) == 40
+    run("prune", scene, "--keep", "90%", "--by", "opacity", "-o", tmp_path / "large.ply")
+    assert f"note: {tmp_path / 'large.ply'} is larger than {scene}: " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("by", ["lightgaussian", "pup"])
 def test_prune_looks_from_the_poses_of_the_run(by, splatfacto_run, tmp_path, capsys):
     run("prune", splatfacto_run, "--keep", "0.5", "--by", by, "-o", tmp_path / "out.ply", "--verbose")

@@ -33,7 +33,7 @@ FAST = {
 }
 """Options that come first, so that a command which can work does not work long."""
 
-LONG = {"train", "demo"}
+LONG = {"train"}
 """Commands that cannot be made short."""
 
 OTHERS = [

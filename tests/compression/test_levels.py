@@ -189,7 +189,7 @@ def test_levels_that_fit_no_scene_are_refused_before_one_is_read(asked, message)
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (["0"], "level 0: keep is 0 Gaussians; expected 1 to 400"),
+        (["0"], "level 0: keep is 0 Gaussians; expected at least 1"),
         ([0.5, 1.5], r"level 1\.5: keep is 1.5"),
         (["0.0001MB"], "level 0.0001MB: keep is 0.0001MB, too small for one Gaussian"),
         ([True], "level True: keep is True"),

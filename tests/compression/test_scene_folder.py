@@ -114,18 +114,6 @@ def test_a_scene_that_another_process_works_on_is_waited_for(folder):
     assert results["b"].status == "done" and made(folder) == {"a": 1, "b": 1, "c": 1}
 
 
-def test_shards_are_disjoint_and_the_last_one_has_the_whole_table(folder):
-    for seed in range(4):
-        write_ply(cloud(4, seed), folder / f"more{seed}.ply")
-    parts = [settle(folder, shard=f"{index}/3") for index in (1, 2, 3)]
-    names = [name for part in parts for name in part]
-    assert len(names) == len(set(names)) == 7 and set(made(folder).values()) == {1}
-    assert {row["status"] for row in table(folder)} == {"done", "done before"}
-    (folder.parent / "small" / "a.ply.json").unlink()
-    settle(folder, shard="3/3")
-    assert [row["name"] for row in table(folder) if row["status"] == "open"] == ["a"]
-
-
 def test_a_damaged_record_or_description_is_never_believed(folder):
     settle(folder)
     record = folder.parent / "small" / "a.ply.json"

@@ -258,10 +258,11 @@ def format_to_write(path: Path | str) -> Format:
 
 
 def format_like(path: Path) -> Format:
-    """The format to write what is made of a scene: that of the scene's file if it can be written, else PLY."""
-    if path.is_file():
+    """The format to write what is made of a scene: that of the scene's file if it can be written, SOG for a SOG folder,
+    else PLY."""
+    if path.is_file() or path.is_dir():
         with suppress(SceneError):  # one that cannot be read, which its reader says
             kind = format_to_read(path)
-            if kind is not None and kind.write is not None and kind.suffix.startswith("."):
-                return kind
+            if kind is not None and kind.write is not None:
+                return format_to_write(kind.budget_suffix)
     return format_to_write(".ply")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from lab import demo as module
 from making import ball, write_run
-from pointsplat_ns.cli import demo as module
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io import read_ply, write_ply
@@ -49,7 +49,7 @@ def test_the_demo_runs_every_command_once_and_starts_anew(small_example, program
     write_run(earlier, 5, 900)  # interrupted
     (output / "capture" / "demo" / "images").mkdir(parents=True)
     (output / "capture" / "mine.jpg").write_text("of the user")
-    main(["demo", "--output", str(output)])
+    module.demo(output)
     assert programs == ["pointsplat", "ns-train splatfacto-cpu", "ns-train pointsplat", "ns-eval", "ns-export"]
     assert [path.name for path in earlier.rglob("*.ckpt")] == ["step-000000011.ckpt"]
     assert (output / "capture" / "mine.jpg").read_text() == "of the user"

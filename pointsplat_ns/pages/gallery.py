@@ -1,0 +1,124 @@
+"""Galleries of scenes before and after: a page, and one picture. A pair of pictures beside each result feeds both."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+import torch
+
+from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import bytes_text, replacing
+from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.looking.content import in_units
+from pointsplat_ns.pages.film import with_labels
+from pointsplat_ns.pages.flight import FlightFrame
+from pointsplat_ns.pages.html import page
+from pointsplat_ns.pages.pictures import fit, read_png
+from pointsplat_ns.rasterizer import render
+from pointsplat_ns.views import Views
+
+if TYPE_CHECKING:
+    from pointsplat_ns.scene_folder import SceneResult
+
+WIDTH, HEIGHT = 640, 400
+"""Size of one picture of a pair, pixels."""
+
+
+def pair_of(output: Path) -> Path:
+    """The file with the pair of pictures of a result."""
+    return output.with_name(f"{output.name}.png")
+
+
+@torch.no_grad()
+def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Path) -> None:
+    """Draw a scene and a smaller one side by side to a PNG file, in the view that its page opens with; ``known`` are
+    its views, if there are any. Raises DataError if nothing of the scene is visible, and SceneError if the file cannot
+    be written."""
+    frame = FlightFrame.of(before, known)
+    views = frame.views.resized(WIDTH)
+    view = views.resized(round(max(views.width, views.height) * min(1.0, HEIGHT / views.height)))[0]
+    pair = torch.zeros(HEIGHT, 2 * WIDTH, 3)
+    top, left = (HEIGHT - view.height) // 2, (WIDTH - view.width) // 2
+    for start, scene in ((left, before), (left + WIDTH, after)):
+        drawn = render(in_units(scene, frame.centre.to(scene.device), frame.size), view)
+        pair[top : top + view.height, start : start + view.width] = drawn.cpu()
+    write_picture(pair, path)
+
+
+def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
+    """Write a page of all scenes before and after, with links to their files. Scenes that failed or are not finished
+    are listed. Raises SceneError if it cannot be written, and DataError if all pictures do not fit into 30 MB."""
+    drawn = {result.name: result for result in results if _pair(result) is not None}
+    pictures = [partial(_picture, result, side) for result in drawn.values() for side in (0, 1)]
+    uris = iter(fit(pictures, limit=30_000_000)[0])
+    scenes = [_facts(result, path, [next(uris) for _ in range(2 * (result.name in drawn))]) for result in results]
+    done = [result for result in results if result.megabytes is not None]
+    sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
+    text = page(
+        "gallery.html", title=title, scenes=scenes, done=len(done), width=WIDTH, height=HEIGHT,
+        sizes=[bytes_text(1e6 * size) for size in sizes],
+    )  # fmt: skip
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
+    """Write one PNG picture of all pairs that are there, with names and sizes. Raises SceneError if it cannot be
+    written."""
+    drawn = [result for result in results if _pair(result) is not None]
+    columns = max(1, math.ceil(math.sqrt(len(drawn) / 3)))
+    step = max(1, math.ceil(math.sqrt(len(drawn) * 2 * WIDTH * HEIGHT / 40e6)))  # at most 40 million pixels
+    height, width = HEIGHT // step, 2 * WIDTH // step
+    sheet = np.full((max(1, math.ceil(len(drawn) / columns)) * height, columns * width, 3), 255, np.uint8)
+    for index, result in enumerate(drawn):
+        pair = np.concatenate([_picture(result, side)[: height * step : step, ::step] for side in (0, 1)], axis=1)
+        before, after = _sizes(result)
+        row, column = divmod(index, columns)
+        labelled = with_labels(pair[:, :width], (f"{result.name}: {before}", after), width // 2)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = labelled
+    write_picture(torch.from_numpy(sheet) / 255, path)
+
+
+def _pair(result: SceneResult) -> np.ndarray | None:
+    """The pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
+    try:
+        return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
+    except DataError:
+        return None
+
+
+def _picture(result: SceneResult, side: int) -> np.ndarray:
+    """The picture of a scene before (0) or after (1); black if it has gone meanwhile."""
+    pair = _pair(result)
+    return np.zeros((HEIGHT, WIDTH, 3), np.uint8) if pair is None else pair[:, side * WIDTH : (side + 1) * WIDTH]
+
+
+def _sizes(result: SceneResult) -> tuple[str, str]:
+    """Count and size before and after."""
+    before, after = (
+        ", ".join(
+            ([] if count is None else [f"{count:,} Gaussians"]) + ([] if size is None else [bytes_text(1e6 * size)])
+        )
+        for count, size in ((result.before, result.megabytes_before), (result.after, result.megabytes))
+    )
+    return before, after
+
+
+def _facts(result: SceneResult, path: Path, pictures: list[str]) -> dict[str, Any]:
+    """What the page at a path says of a scene."""
+    finished = result.megabytes is not None
+    quality = "" if result.psnr is None else f"{result.psnr:.1f} dB PSNR against the scene's own renders"
+    said = "; ".join(filter(None, (quality, result.note))) if finished else result.error or "not finished"
+    link = quote(Path(os.path.relpath(result.output, path.parent)).as_posix()) if finished else ""
+    return {
+        "name": result.name, "file": Path(result.output).name, "link": link, "pictures": pictures,
+        "sizes": _sizes(result), "failed": bool(result.error), "said": said,
+    }  # fmt: skip
