@@ -16,12 +16,14 @@ from typing import Annotated
 
 import torch
 import tyro
+from torch import Tensor
+from torch.nn.functional import interpolate
 
 import pointsplat_ns as ps
 from lab.common.compare import metrics_of, photos_of
 from lab.common.printing import console, number, start, table
 from lab.common.scenes import group_of
-from pointsplat_ns.compression.cleaning import find_junk
+from pointsplat_ns.compression.cleaning import floating_scores
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.rasterizer import render
@@ -32,35 +34,42 @@ from pointsplat_ns.system.tensors import normal_mode
 @torch.no_grad()
 def main(
     runs: Annotated[list[Path], tyro.conf.Positional],
-    strengths: tuple[float, ...] = (0.0, 0.5, 1.0),
+    strengths: tuple[float, ...] = (0.5, 1.0),
     sampled: bool = False,
-    photos: int = 12,
+    photos: int = 8,
+    side: int = 320,
 ) -> None:
-    """Print the change of PSNR and SSIM in held-out photos.
+    """Print the change of PSNR and SSIM in held-out photos without floaters.
 
     Args:
         runs: folders of trained runs whose data is at hand.
         strengths: of floaters.
         sampled: find floaters in sampled views, in place of those of the training photos.
         photos: largest number of photos.
+        side: longer side that photos are reduced to, pixels.
     """
     for run in runs:
         dense = ps.load(run)
-        name, views, targets = photos_of(run, "test", photos)
-        before = [metrics_of(render(dense, view), photo, None) for view, photo in zip(views, targets, strict=True)]
-        floating = view_source(dense, run=None if sampled else run).scored(VIEW_COUNTS.scored)
+        name, views, whole = photos_of(run, "test", photos)
+        views = views.resized(side)
+        size = views.height, views.width
+        targets = [interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0) for photo in whole]
+
+        def measured(scene: ps.Gaussians, views: ps.Views = views, targets: list[Tensor] = targets) -> dict[str, list]:
+            pairs = [metrics_of(render(scene, view), target, None) for view, target in zip(views, targets, strict=True)]
+            return {key: [pair[key] for pair in pairs] for key in ("psnr", "ssim")}
+
+        before = measured(dense)
+        source = view_source(dense, run=None if sampled else run)
+        scores = floating_scores(dense, source.scored(VIEW_COUNTS.scored))
         rows = []
         for strength in strengths:
-            gone = find_junk(dense, floating=floating, strength=strength).indices
-            kept = torch.ones(len(dense), dtype=torch.bool)
-            kept[gone] = False
-            scene = dense[kept]
-            after = [metrics_of(render(scene, view), photo, None) for view, photo in zip(views, targets, strict=True)]
-            psnr, ssim = ([b[key] - a[key] for a, b in zip(before, after, strict=True)] for key in ("psnr", "ssim"))
+            after = measured(dense[scores >= strength])
+            psnr, ssim = ([b - a for a, b in zip(before[key], after[key], strict=True)] for key in before)
             changes = map(number(3, sign="+"), (mean(psnr), min(psnr), max(psnr), mean(ssim)))
-            rows.append([f"{strength:g}", number(2)(100 * len(gone) / len(dense)), *changes])
+            rows.append([f"{strength:g}", number(2)(100 * float((scores < strength).double().mean())), *changes])
         heads = ("strength", "removed, %", "PSNR, dB", "worst photo", "best photo", "SSIM")
-        title = f"{name} ({group_of(name)}): {mean(a['psnr'] for a in before):.2f} dB in {len(views)} held-out photos"
+        title = f"{name} ({group_of(name)}): {mean(before['psnr']):.2f} dB in {len(views)} held-out photos"
         console().print(table(title, heads, rows))
 
 

@@ -39,7 +39,9 @@ PLACES = 16
 """Number of places of cameras. More places remove less and take longer."""
 
 FLOATING = 0.25
-"""Largest difference in colour of a Gaussian that floats, right before the camera, at a strength of 1."""
+"""Largest difference in colour, root of the sum of squares of red, green and blue, of a Gaussian that floats right
+before the camera at a strength of 1. At half the strength, held-out photos lose at most 0.05 dB on average
+(``python -m lab.judge.cleaning RUN``)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,7 +116,7 @@ def plot_cleaning(dense: Gaussians, gone: Gaussians, cleaned: Gaussians, views: 
     from matplotlib import colormaps
 
     gone = gone[gone.usable()]
-    colors = torch.tensor(colormaps["tab10"].colors)[clusters(gone).clamp_max(9)]
+    colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[clusters(gone).clamp_max(9)]
     marked = gone.replace(
         features_dc=((colors - 0.5) / SH_C0).to(gone.means), features_rest=torch.zeros_like(gone.features_rest)
     )
