@@ -61,7 +61,7 @@ def main(
 
         before = measured(dense)
         source = view_source(dense, run=None if sampled else run)
-        scores = floating_scores(dense, source.scored(VIEW_COUNTS.scored))
+        scores, _ = floating_scores(dense, source.scored(VIEW_COUNTS.scored))
         rows = []
         for strength in strengths:
             after = measured(dense[scores >= strength])

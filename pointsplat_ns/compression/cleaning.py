@@ -87,8 +87,8 @@ def find_junk(
     scene: Gaussians, progress: Progress = silent, floating: Views | None = None, strength: float = 0
 ) -> Junk:
     """Find the Gaussians that cannot be drawn, those that no camera sees, and with a strength those that float in the
-    views ``floating``: indices on the CPU. All are junk if none can be drawn. The result is deterministic, and but for
-    rounding does not depend on the unit of length."""
+    views ``floating``, which are cameras, too: indices on the CPU. All are junk if none can be drawn. The result is
+    deterministic, and but for rounding does not depend on the unit of length."""
     usable = scene.usable()
     drawable = usable & (scene.alphas >= ALPHA_MIN)
     order = torch.where(usable, scene.alphas, -1.0).sort(stable=True).indices
@@ -107,16 +107,18 @@ def find_junk(
         places = len(views) // 6
         visible[drawn] = has_pixels | ~has_pixels.any()  # empty images are no evidence
     floats = order[:0]
-    if floating is not None and strength > 0:
+    if floating is not None:
         scores = torch.full_like(scene.alphas, math.inf, dtype=torch.float64)
-        scores[drawn] = floating_scores(scene[drawn], floating, progress)
-        scores, floats = torch.where(visible, scores, math.inf).sort(stable=True)
+        scores[drawn], shown = floating_scores(scene[drawn], floating, progress)
+        visible[drawn] |= shown
+        scores, floats = scores.sort(stable=True)
         floats = floats[scores < strength]
     return Junk(undrawable.cpu(), order[~visible[order]].cpu(), floats.cpu(), places)
 
 
-def floating_scores(scene: Gaussians, views: Views, progress: Progress = silent) -> Tensor:
-    """How little a Gaussian floats, (N,) float64, infinite where no view shows it before something else.
+def floating_scores(scene: Gaussians, views: Views, progress: Progress = silent) -> tuple[Tensor, Tensor]:
+    """How little a Gaussian floats, (N,) float64, infinite where no view shows it before something else; and whether
+    any view shows it, (N,).
 
     Over all pixels of all views, and weighted by the Gaussian's blend weights, let r be the mean of its depth divided
     by the depth of the picture, and d the mean squared difference of its colour (without SH) from that of the picture,
@@ -128,7 +130,8 @@ def floating_scores(scene: Gaussians, views: Views, progress: Progress = silent)
         progress("looking for floaters", (done + 1) / len(views))
     pixels, near, difference = totals.unbind(1)
     free = (pixels - near) / pixels  # NaN where no view shows it
-    return torch.where(free > 0, ((difference / pixels).clamp_min(0.01**2) / free).sqrt() / FLOATING, math.inf)
+    scores = ((difference / pixels).clamp_min(0.01**2) / free).sqrt() / FLOATING
+    return torch.where(free > 0, scores, math.inf), pixels > 0
 
 
 def _seen_through(scene: Gaussians, view: View) -> Tensor:
@@ -171,15 +174,15 @@ def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
 
 
 def clean_scene(
-    dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent, strength: float = 0
+    dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent, strength: float | None = None
 ) -> Cleaning:
-    """Find the junk of a scene, and measure the PSNR of renders without it. Views decide only which Gaussians float. At
-    least ``at_least`` Gaussians, in 1..N, remain."""
+    """Find the junk of a scene, and measure the PSNR of renders without it. Views decide what floats, and what they
+    show is not unseen; without a strength they decide nothing. At least ``at_least`` Gaussians, in 1..N, remain."""
     try:
-        floating = views.scored(VIEW_COUNTS.scored) if strength > 0 else None
+        floating = None if strength is None else views.scored(VIEW_COUNTS.scored)
     except DataError:  # no views
         floating = None
-    junk = find_junk(dense, progress, floating, strength)
+    junk = find_junk(dense, progress, floating, strength or 0.0)
     dropped = junk.first(len(dense) - at_least)
     if len(dropped.indices) == 0:
         why = f"; {len(junk.indices):,} could go, but the budget keeps all" if len(junk.indices) else ""

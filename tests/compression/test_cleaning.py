@@ -208,6 +208,17 @@ def test_haze_before_a_wall_floats_and_a_red_blob_stays(unit):
     assert len(find_junk(scene, floating=views).floating) == 0, "strength 0"
 
 
+def test_what_a_given_view_shows_is_not_unseen(room):
+    """A view from behind the walls, where nobody looks from otherwise."""
+    scene = Gaussians.cat([room, JUNK["floaters"]])
+    viewmat = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]])
+    K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]])
+    behind = Views(viewmat[None].double(), K[None], 32, 32, torch.zeros(3))
+    hidden, shown = {*find_junk(scene).unseen.tolist()}, {*find_junk(scene, floating=behind).unseen.tolist()}
+    near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
+    assert near <= hidden and not near & shown
+
+
 def test_the_score_is_its_formula():
     """Weights of each Gaussian at each pixel by rendering one channel each, in float64."""
     scene, views = before_a_wall()
@@ -226,7 +237,7 @@ def test_the_score_is_its_formula():
         totals[2] += (weights * apart.square().sum(-1)).sum((0, 1))
     free, difference = totals[1] / totals[0], (totals[2] / totals[0]).clamp_min(1e-4)
     expected = (difference / free).sqrt() / FLOATING
-    found = {dtype: floating_scores(scene.to(dtype), views) for dtype in (torch.float32, torch.float64)}
+    found = {dtype: floating_scores(scene.to(dtype), views)[0] for dtype in (torch.float32, torch.float64)}
     before = free > 0.01  # the wall stands before nothing, to rounding
     assert before.tolist() == [False] * (len(scene) - 2) + [True] * 2
     # float32 depths are within 1e-6 of their size, free is at least 0.01
@@ -240,8 +251,8 @@ def test_what_stands_before_nothing_never_floats(opacity):
     scene, views = before_a_wall()
     scene = scene.replace(opacities=torch.full_like(scene.opacities, opacity))
     for some in (scene[:1], scene[-1:], scene[:-2]):
-        assert bool((floating_scores(some, views) > 1).all())
-    assert floating_scores(scene[:0], views).shape == (0,)
+        assert bool((floating_scores(some, views)[0] > 1).all())
+    assert floating_scores(scene[:0], views)[0].shape == (0,)
 
 
 def test_values_that_are_not_finite_are_no_floaters():
