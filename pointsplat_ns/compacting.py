@@ -105,7 +105,8 @@ def clean(
 
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
-        strength: in [0, 1]; see :mod:`pointsplat_ns.compression.cleaning`. 0 removes no floaters.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
+            hardly change. 0 removes none.
         picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the result.
         views, resolution, up, data, progress: as for :func:`pointsplat_ns.prune`.
 

@@ -26,8 +26,8 @@ def clean(
 
     Args:
         output: file to write: .ply, .spz, .sog, .splat, .glb; by default room_clean.ply beside room.ply.
-        strength: what floats: Gaussians whose mean depth is less than this share of the depth of what views show
-            there, in [0, 1]. 0 removes only what cannot be drawn or seen.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
+            hardly change. 0 removes only what cannot be drawn or seen.
         picture: a .png file that shows, in three views, the scene, what goes in a colour for each cluster, and the
             result; by default none.
     """
