@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
+    from pointsplat_ns.compacting import clean
     from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
 _PUBLIC = {
     "pointsplat_ns.api": ("compact", "example_room", "load", "lod", "plot_views", "prune"),
+    "pointsplat_ns.compacting": ("clean",),
     "pointsplat_ns.compression.compacted": ("Compacted",),
     "pointsplat_ns.levels.levels": ("Levels",),
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
@@ -76,7 +78,7 @@ _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
     "BudgetError", "Compacted", "DataError", "Gaussians", "Levels", "MissingPackageError", "PointSplatError",
-    "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "compact",
+    "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "clean", "compact",
     "compact_folder", "dataset_views", "example_room", "info", "load", "load_refiner", "lod", "lpips",
     "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_distributions", "plot_views", "prune",
     "psnr", "rasterization", "refine", "render", "render_path", "sample_views", "save", "ssim", "write_page",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import SceneError
+from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
@@ -79,6 +79,78 @@ def prune_source(
         seconds = time.perf_counter() - start
     _log_details(pruned.notes, source)
     return dense, pruned.scene, seconds, source
+
+
+def clean(
+    scene: Source,
+    strength: float = 0.5,
+    *,
+    picture: str | Path | None = None,
+    views: Views | str | Path | None = None,
+    resolution: tuple[int, int] | str | None = None,
+    up: str | None = None,
+    data: str | Path | None = None,
+    progress: bool | Progress = False,
+) -> Gaussians:
+    """Remove floaters from a scene, and what cannot be drawn or is seen from nowhere. No photos are needed.
+
+    Findings (counts, clusters, PSNR without what goes) are logged at level INFO.
+
+    Args:
+        scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
+            hardly change. 0 removes none.
+        picture: a PNG file to write: the scene, what goes in a colour for each cluster, and the result.
+        views, resolution, up, data, progress: as for :func:`pointsplat_ns.prune`.
+
+    Returns:
+        The other Gaussians, bit for bit and in order, at least one, on the device of the given scene.
+
+    Raises:
+        SceneError: if no Gaussian can be drawn, or a file is not usable.
+        PointSplatError: if the strength is not in [0, 1].
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> room = ps.example_room()[::10]
+        >>> len(ps.clean(room)) <= len(room)
+        True
+    """
+    return clean_source(scene, strength, Looking(views, resolution, up, data), picture, progress)[1]
+
+
+@normal_mode
+def clean_source(
+    scene: Source,
+    strength: float,
+    looking: Looking,
+    picture: str | Path | None = None,
+    progress: bool | Progress = False,
+    compared: str = "",
+) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
+    """Read a scene and clean it, as :func:`clean`; results are those of :func:`prune_source`."""
+    from pointsplat_ns.compression.cleaning import clean_scene
+    from pointsplat_ns.compression.pictures import plot_cleaning
+    from pointsplat_ns.compression.quality import quality_if_seen
+    from pointsplat_ns.looking.view_source import VIEW_COUNTS
+    from pointsplat_ns.pruning import need_usable
+
+    if not 0 <= strength <= 1:
+        raise PointSplatError(f"strength {strength!r}: expected a number in [0, 1]")
+    dense, source = read_source(scene, looking)
+    need_usable(dense)
+    start = time.perf_counter()
+    with progress_bar(progress) as report:
+        cleaning = clean_scene(dense, 1, source, report, strength)
+        cleaned = cleaning.apply(dense, 1)
+        seconds, quality = time.perf_counter() - start, None
+        if picture is not None:
+            gone = dense[cleaning.junk.first(len(dense) - 1).indices.to(dense.device)]
+            plot_cleaning(dense, gone, cleaned, source.scored(VIEW_COUNTS.scored), picture)
+        if compared:
+            quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), cleaned, compared)
+    log(cleaning.notes)
+    return dense, cleaned, seconds, quality
 
 
 @normal_mode

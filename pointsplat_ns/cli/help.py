@@ -18,6 +18,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("with the photos and their COLMAP model", "pointsplat compact room.ply --photos images --poses sparse/0"),
         ("every scene of a folder, and a gallery", "pointsplat compact rooms --keep 10% --jobs 4 --html all.html"),
     ),
+    "clean": (
+        ("what floats or is hidden goes, to room_clean.ply", "pointsplat clean room.ply"),
+        ("a picture of what goes", "pointsplat clean room.ply --strength 0.3 --picture gone.png"),
+    ),
     "lod": (
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
         ("a stream with a page for the web", "pointsplat lod room.ply --stream --html -o page"),

@@ -78,13 +78,14 @@ def print_result(
     from pointsplat_ns.io.files import bytes_text
     from pointsplat_ns.pruning import ply_bytes
 
-    *first, last = ["merged" if by == "merge" else f"pruned by {by}", *also]
+    *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
     size = bytes_text(ply_bytes(len(scene), scene.sh_degree)) + " as .ply" if where is None else written_size(where)
     place = "dry run, nothing is written" if where is None else where
     what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
     if len(scene) == before and not also:
-        what = f"nothing is {'merged' if by == 'merge' else 'pruned'}, all {before:,} Gaussians fit as they are"
+        nothing = {"merge": "nothing is merged", "clean": "nothing is removed"}.get(by, "nothing is pruned")
+        what = f"{nothing}, all {before:,} Gaussians fit as they are"
     print(f"{place}: {what}, {size}, in {seconds_text(seconds)}")
     print(quality or "not compared with the dense scene: nothing of it is visible")
 

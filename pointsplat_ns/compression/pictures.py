@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections.abc import Sequence
@@ -12,16 +13,18 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pointsplat_ns.compression.cleaning import clusters
 from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning.paper import log_volume
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.rasterizer import render, render_with_alpha
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import spread_indices
+from pointsplat_ns.views import Views, spread_indices
 
 
 @torch.no_grad()
@@ -114,6 +117,28 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
         f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}\n"
         f"at least two of the views show {share:.0%} of the visible content"
     )
+
+
+@torch.no_grad()
+def plot_cleaning(dense: Gaussians, gone: Gaussians, cleaned: Gaussians, views: Views, path: Path | str) -> None:
+    """Draw the three of some views in which most pixels go: the dense scene; what goes, before the scene in grey, the
+    ten largest clusters in colours of their own; and the cleaned scene. ``gone`` may hold what cannot be drawn."""
+    from matplotlib import colormaps
+
+    gone = gone[gone.usable()]
+    colors = torch.from_numpy(colormaps["tab10"](np.arange(10))[:, :3])[clusters(gone).clamp_max(9)]
+    marked = gone.replace(
+        features_dc=((colors - 0.5) / SH_C0).to(gone.means), features_rest=torch.zeros_like(gone.features_rest)
+    )
+    views = dataclasses.replace(views, background=torch.zeros_like(views.background))
+    shares = torch.stack([render_with_alpha(marked, view)[1].sum() for view in views])
+    rows = []
+    for view in views[shares.argsort(descending=True, stable=True)[:3].cpu()]:
+        before, (over, alpha) = render(dense, view), render_with_alpha(marked, view)
+        grey = 0.2 + 0.5 * before.mean(-1, keepdim=True).expand_as(before)
+        rows.append([before.cpu(), (over + (1 - alpha) * grey).cpu(), render(cleaned, view).cpu()])
+    titles = [f"{len(dense):,} Gaussians", f"{len(dense) - len(cleaned):,} go", f"{len(cleaned):,} stay"]
+    side_by_side(rows, titles, path)
 
 
 def side_by_side(rows: Sequence[Sequence[ArrayLike]], titles: list[str], path: Path | str) -> None:

@@ -2,6 +2,8 @@
 
 from pointsplat_ns.rasterizer.reference import rasterize_reference
 from pointsplat_ns.rasterizer.rendering import rasterization
-from pointsplat_ns.rasterizer.scene import pixels_of, render, render_depth, render_with_alpha
+from pointsplat_ns.rasterizer.scene import pixel_sums, pixels_of, render, render_depth, render_with_alpha
 
-__all__ = ["pixels_of", "rasterization", "rasterize_reference", "render", "render_depth", "render_with_alpha"]
+__all__ = [
+    "pixel_sums", "pixels_of", "rasterization", "rasterize_reference", "render", "render_depth", "render_with_alpha",
+]  # fmt: skip

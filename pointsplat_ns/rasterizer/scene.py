@@ -140,17 +140,27 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     weight, which is its alpha times the transmittance in front of it. It is the gradient of the sum of the picture by
     the colour, and 0 where the view does not show the Gaussian. ``compiled`` is that of
     :func:`pointsplat_ns.rasterization`."""
-    scene = scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
     with suitable_threads(scene.device):
-        if pictures.can_draw(scene, compiled):
-            weights = pictures.weights(scene, _camera(scene, view), ALPHA_MIN, MOST_PAIRS)
+        if pictures.can_draw(single := _at_least_single(scene), compiled):
+            weights = pictures.weights(single, _camera(scene, view), ALPHA_MIN, MOST_PAIRS)
             if weights is not None:
                 return weights
-        with torch.enable_grad():
-            colors = torch.zeros_like(scene.means[:, :1]).requires_grad_()
-            image, _ = _rasterized(scene, view, colors, compiled=compiled)
-            (pixels,) = torch.autograd.grad(image.sum(), colors)
-    return pixels[:, 0]
+    return pixel_sums(scene, view, torch.ones(view.height, view.width, 1, device=scene.device), compiled)[:, 0]
+
+
+def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None = None) -> Tensor:
+    """Sums (N, D) over the pixels of a view of the blending weight of each Gaussian times the values of D maps,
+    (H, W, D): :func:`pixels_of` for a map of ones."""
+    scene = _at_least_single(scene)
+    with suitable_threads(scene.device), torch.enable_grad():
+        colors = torch.zeros(len(scene), maps.shape[-1], dtype=scene.dtype, device=scene.device).requires_grad_()
+        image, _ = _rasterized(scene, view, colors, compiled=compiled)
+        (sums,) = torch.autograd.grad(image, colors, maps.to(image))
+    return sums
+
+
+def _at_least_single(scene: Gaussians) -> Gaussians:
+    return scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
 
 
 def _alphas(scene: Gaussians) -> Tensor:

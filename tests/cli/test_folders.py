@@ -128,6 +128,7 @@ def test_prune_and_convert_take_a_folder_and_go_on_where_they_were(folder, tmp_p
         (("convert", "rooms/room1.ply", "a.spz", "--to", ".spz"), "one scene; --to is for a folder of scenes"),
         (("info", "empty"), "empty: no scene below it"),
         (("lod", "rooms"), "take a folder of scenes"),
+        (("clean", "rooms"), "take a folder of scenes"),
     ],
 )
 def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, tmp_path, monkeypatch, capsys):

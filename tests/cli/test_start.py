@@ -39,7 +39,7 @@ def test_next_to_nothing_is_imported_before_ctrl_c_is_caught():
 
 
 def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path):
-    alone = [*(f"{name} a.ply" for name in ("prune", "compact", "lod", "tradeoff")), "convert a.ply b.spz"]
+    alone = [*(f"{name} a.ply" for name in ("prune", "compact", "clean", "lod", "tradeoff")), "convert a.ply b.spz"]
     alone += ["export a.ply -o b.ply"]
     both = ["info a.ply b.ply", "render a.ply b.ply", "view a.ply b.ply"]
     script = (
@@ -74,6 +74,7 @@ def test_too_little_address_space_for_torch_is_one_line(gigabytes):
     [
         ["prune", ""], ["prune", "a.ply", "-o", ""], ["info", "a.ply", ""], ["convert", "a.ply", ""], ["view", ""],
         ["compact", "", "--keep", "10%"], ["render", "a.ply", "-o", ""], ["export", "", "-o", "a.ply"], ["lod", ""],
+        ["clean", "", "-o", "a.ply"],
         ["tradeoff", ""], ["train", ""],
         ["demo", "--output", ""],
         ["prune", "a.ply", "--poses", ""],

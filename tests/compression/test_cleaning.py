@@ -9,7 +9,15 @@ import torch
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import PLACES, Cleaning, clean_scene, find_junk
+from pointsplat_ns.compression.cleaning import (
+    FLOATING,
+    PLACES,
+    Cleaning,
+    clean_scene,
+    clusters,
+    find_junk,
+    floating_scores,
+)
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
@@ -130,7 +138,7 @@ def test_of_alike_ones_those_that_show_stay(scene, most):
 
 def test_a_scene_of_which_nothing_can_be_drawn_is_all_junk():
     faint = box_room(0, 10).replace(opacities=torch.full((10, 1), -20.0))
-    junk = find_junk(faint)
+    junk = find_junk(faint, floating=sample_views(box_room(0, 10), 1, 8, 8), strength=1)
     assert len(junk.undrawable) == 10 and junk.places == 0
     assert len(Cleaning(junk, 10, ()).apply(faint, 4)) == 4
 
@@ -174,3 +182,105 @@ def test_compact_cleans_if_asked(room, views):
     assert len(result.pruned) == (ROOM + PLANTED) // 2
     assert int((result.pruned.means[:, 0].abs() > 3).sum()) == 0
     assert any("removed that are seen from nowhere" in note for note in result.notes)
+
+
+def before_a_wall(unit: float = 1.0) -> tuple[Gaussians, Views]:
+    """A grey wall at 4, and before it, at 1, haze of its colour, then a red opaque blob; and two views of them."""
+    across = torch.linspace(-4, 4, 25)
+    wall = torch.cartesian_prod(across, across, torch.tensor([4.0]))
+    before = torch.tensor([[-0.3, 0.0, 1.0], [0.3, 0.0, 1.0]])
+    scene = blobs(torch.cat([wall, before]), math.log(0.2), 9.0)
+    scene.features_dc[:] = 0.0
+    scene.features_dc[-1] = torch.tensor([1.5, -1.5, -1.5])
+    scene.opacities[-2] = -1.0
+    scene = scene.replace(means=scene.means * unit, scales=scene.scales + math.log(unit))
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    viewmats[1, 0, 3] = 0.2 * unit
+    K = torch.tensor([[24.0, 0.0, 16.0], [0.0, 24.0, 12.0], [0.0, 0.0, 1.0]])
+    return scene, Views(viewmats, K.repeat(2, 1, 1), 32, 24, torch.zeros(3), near_plane=0.01 * unit)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_haze_before_a_wall_floats_and_a_red_blob_stays(unit):
+    scene, views = before_a_wall(unit)
+    junk = find_junk(scene, floating=views, strength=0.5)
+    assert junk.floating.tolist() == [len(scene) - 2]
+    assert len(find_junk(scene, floating=views).floating) == 0, "strength 0"
+
+
+def test_what_a_given_view_shows_is_not_unseen(room):
+    """A view from behind the walls, where nobody looks from otherwise."""
+    scene = Gaussians.cat([room, JUNK["floaters"]])
+    viewmat = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]])
+    K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]])
+    behind = Views(viewmat[None].double(), K[None], 32, 32, torch.zeros(3))
+    hidden, shown = {*find_junk(scene).unseen.tolist()}, {*find_junk(scene, floating=behind).unseen.tolist()}
+    near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
+    assert near <= hidden and not near & shown
+
+
+def test_the_score_is_its_formula():
+    """Weights of each Gaussian at each pixel by rendering one channel each, in float64."""
+    scene, views = before_a_wall()
+    scene = scene.to(torch.float64)[scene.means[:, :2].norm(dim=1) < 1.9]
+    totals = torch.zeros(3, len(scene), dtype=torch.float64)
+    colors = (0.5 + 0.28209479177387814 * scene.features_dc).clamp(0, 1)
+    for view in views:
+        camera = {"viewmats": view.viewmat[None], "Ks": view.K[None].double(), "width": 32, "height": 24}
+        shape = scene.means, scene.quats, scene.stds, scene.alphas
+        weights = ps.rasterization(*shape, torch.eye(len(scene), dtype=torch.float64), **camera)[0][0]  # [H, W, N]
+        depths = scene.means[:, 2]
+        shown = (weights @ depths / weights.sum(-1)).nan_to_num(1.0)
+        apart = (weights @ colors)[:, :, None] - colors
+        totals[0] += weights.sum((0, 1))
+        totals[1] += (weights * (1 - depths / shown[..., None])).sum((0, 1))
+        totals[2] += (weights * apart.square().sum(-1)).sum((0, 1))
+    free, difference = totals[1] / totals[0], (totals[2] / totals[0]).clamp_min(1e-4)
+    expected = (difference / free).sqrt() / FLOATING
+    found = {dtype: floating_scores(scene.to(dtype), views)[0] for dtype in (torch.float32, torch.float64)}
+    before = free > 0.01  # the wall stands before nothing, to rounding
+    assert before.tolist() == [False] * (len(scene) - 2) + [True] * 2
+    # float32 depths are within 1e-6 of their size, free is at least 0.01
+    for dtype, within in ((torch.float32, 1e-3), (torch.float64, 1e-9)):
+        torch.testing.assert_close(found[dtype][before], expected[before], rtol=within, atol=0)
+
+
+@pytest.mark.parametrize("opacity", [40.0, -4.0])
+def test_what_stands_before_nothing_never_floats(opacity):
+    """One Gaussian, and opaque or faint walls without anything before them."""
+    scene, views = before_a_wall()
+    scene = scene.replace(opacities=torch.full_like(scene.opacities, opacity))
+    for some in (scene[:1], scene[-1:], scene[:-2]):
+        assert bool((floating_scores(some, views)[0] > 1).all())
+    assert floating_scores(scene[:0], views)[0].shape == (0,)
+
+
+def test_values_that_are_not_finite_are_no_floaters():
+    scene, views = before_a_wall()
+    odd = blobs(torch.tensor([[0.0, 0.0, 1.0]] * 4), 0.0, 1.0)
+    odd.means[0, 0], odd.scales[1, 1], odd.opacities[2], odd.features_dc[3, 0] = math.nan, 1e4, -math.inf, 1e38
+    junk = find_junk(Gaussians.cat([odd, scene]), floating=views, strength=1)
+    assert set(junk.undrawable.tolist()) >= {0, 2} and not {0, 1, 2} & {*junk.floating.tolist()}
+
+
+def test_clusters_are_what_touches_the_largest_first():
+    places = torch.tensor([[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.6, 0.0, 0.0], [9.1, 0.0, 0.0]])
+    assert clusters(blobs(places, math.log(0.1), 0.0)).tolist() == [1, 0, 0, 0, 1]
+    assert clusters(blobs(places[:1], 0.0, 0.0)).tolist() == [0]
+    assert clusters(blobs(places[:0], 0.0, 0.0)).tolist() == []
+    assert clusters(blobs(places, 40.0, 0.0)).tolist() == [0] * 5, "of any size"
+
+
+def test_clean_keeps_the_others_bit_for_bit_and_at_least_one(tmp_path):
+    scene, views = before_a_wall()
+    cleaned = ps.clean(scene, views=views, picture=tmp_path / "gone.png")
+    assert same_bits(cleaned, scene[[*range(len(scene) - 2), len(scene) - 1]])
+    assert (tmp_path / "gone.png").read_bytes()[:4] == b"\x89PNG"
+    assert len(ps.clean(scene[:1], 1.0, views=views, picture=tmp_path / "none.png")) == 1
+    faint = scene.replace(opacities=torch.full_like(scene.opacities, -20.0))
+    assert len(ps.clean(faint, views=views)) == 1
+    with pytest.raises(ps.SceneError, match="can be drawn"):
+        ps.clean(scene.replace(means=scene.means * math.nan))
+    for strength in (-0.1, 1.1, math.nan):
+        with pytest.raises(ps.PointSplatError, match=r"expected a number in \[0, 1\]"):
+            ps.clean(scene, strength)

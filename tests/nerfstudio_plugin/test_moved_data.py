@@ -47,6 +47,7 @@ def test_the_data_is_found_at_or_below_the_folder_that_is_named(runs, moved, tra
 COMMANDS = {
     "prune": "RUN --keep 50% --by lightgaussian -o OUT/a.ply --json",
     "compact": "RUN --keep 50% --effort instant -o OUT/a.ply --json",
+    "clean": "RUN -o OUT/a.ply",
     "lod": "RUN --levels 50% -o OUT/lod",
     "render": "RUN --seconds 0.1 -o OUT/a.png",
     "tradeoff": "RUN --keep 10% --views 2 --repairs none -o OUT/trade",

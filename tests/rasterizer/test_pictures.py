@@ -158,3 +158,11 @@ def test_gradients_and_other_precisions_are_left_to_the_general_way():
     assert leaf.features_dc.grad.abs().sum() > 0
     with torch.no_grad():
         assert pictures.can_draw(leaf, None)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_of_no_gaussians_the_background_is_drawn(count):
+    scene, view = scene_of(1, 1)[:count], view_of()
+    scene = scene.replace(means=scene.means - 50.0)  # behind the camera, if there is one
+    assert torch.equal(render(scene, view), view.background.expand(HEIGHT, WIDTH, 3))
+    assert pixels_of(scene, view).tolist() == [0.0] * count

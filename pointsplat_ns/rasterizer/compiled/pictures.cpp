@@ -189,6 +189,7 @@ void pointsplat_place(const Placing* task, int64_t* next) {
 // from its second place on.
 void pointsplat_count_placed(const Placing* task) {
     const int64_t ranges = (task->scene.count + RANGE - 1) / RANGE;
+    if (ranges == 0) return;  // no Gaussians
     const double nearest = *std::min_element(task->nearest, task->nearest + ranges);
     int64_t drawn = 0;
     for (int64_t range = 0; range < ranges; ++range) {

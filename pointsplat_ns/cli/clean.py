@@ -1,0 +1,54 @@
+"""``pointsplat clean``: a scene without what no picture needs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from pointsplat_ns.cli import scene_options as options
+from pointsplat_ns.cli.printing import print_json, print_result, scene_result
+
+
+def clean(
+    scene: options.Scene,
+    output: options.Output = None,
+    strength: float = 0.5,
+    picture: Path | None = None,
+    poses: options.Poses = None,
+    resolution: options.Resolution = None,
+    up: options.Up = None,
+    data: options.Data = None,
+    force: options.Force = False,
+    threads: options.Threads = None,
+    json_output: options.Json = False,
+) -> None:
+    """Remove floaters, and what cannot be drawn or is seen from nowhere.
+
+    Args:
+        output: file to write: .ply, .spz, .sog, .splat, .glb; by default room_clean.ply beside room.ply.
+        strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
+            hardly change. 0 removes only what cannot be drawn or seen.
+        picture: a .png file that shows, in three views, the scene, what goes in a colour for each cluster, and the
+            result; by default none.
+    """
+    options.need_scenes(scene)
+    import pointsplat_ns as ps
+    from pointsplat_ns.compacting import Looking, clean_source
+    from pointsplat_ns.io.formats import format_to_write
+    from pointsplat_ns.system.threads import fixed_threads
+
+    options.need_one_scene(scene)
+    options.check_poses(poses)
+    output = output or options.output_beside(scene, "clean")
+    options.claim_outputs(output, force, picture)
+    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).budget_suffix
+    with fixed_threads(threads):
+        dense, cleaned, seconds, quality = clean_source(scene, strength, looking, picture, True, suffix)
+        ps.save(cleaned, output, progress=True, overwrite=True)
+    if json_output:
+        compared = asdict(quality) if quality else {"psnr": None}
+        print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})
+        return
+    print_result("clean", [], len(dense), cleaned, seconds, output, quality)
+    if picture is not None:
+        print(f"{picture}: the scene, what goes, and the result, side by side")
