@@ -28,7 +28,6 @@ from pointsplat_ns.io.ply_dialects import (
     columns_of,
     has_plain_colors,
     is_flat,
-    with_plain_names,
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
@@ -78,7 +77,7 @@ class PlyRows:
     def __init__(self, path: Path | str, warn: bool = True, whole: bool = False):
         self.path = path = require_file(path, "a 3DGS PLY file")
         with _opened(path) as stream:
-            header = with_plain_names(read_header(stream, path))
+            header = read_header(stream, path)
         vertex = _gaussian_element(header, path)
         self.count, self._in_file = vertex.count, _num_rest(vertex, path)
         self.rest = min(self._in_file, MAX_REST)

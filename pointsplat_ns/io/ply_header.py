@@ -30,7 +30,8 @@ _TYPES = {
     "float": "float32", "float32": "float32", "double": "float64", "float64": "float64",
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
+_PREFIXED = re.compile(r"(?:scalar_)?(?:scal_)?(f_dc_\d|f_rest_\d+|opacity|scale_\d|rot_\d|filter_3D)")
+"""Vertex properties of 3DGS, also with the prefixes that CloudCompare gives them."""
 
 ANTIALIASED = "SplatRenderMode: mip"
 """The comment of a scene that was trained with antialiasing, as Brush and splat-transform write it."""
@@ -88,8 +89,9 @@ class Header:
 
 
 def read_header(stream: BinaryIO, path: Path) -> Header:
-    """Parse the header at the start of ``stream``, which is left at an unspecified position. Raises SceneError if it is
-    not a PLY header, has no end, or has a line that is not valid PLY."""
+    """Parse the header at the start of ``stream``, which is left at an unspecified position. Vertex properties have the
+    names of 3DGS, without prefixes. Raises SceneError if it is not a PLY header, has no end, or has a line that is not
+    valid PLY."""
     text, size = _header_text(stream, path)
     order: str | None = None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -121,6 +123,12 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     _reject_duplicates([name for name, _, _ in elements], "element", path)
     for name, _, properties in elements:
         _reject_duplicates([prop for prop, _ in properties], f"{name} property", path)
+        names = {prop for prop, _ in properties}
+        for index, (prop, kind) in enumerate(properties):
+            found = _PREFIXED.fullmatch(prop) if name == "vertex" else None
+            if found and found[1] not in names:  # nor a second one with another prefix
+                names.add(found[1])
+                properties[index] = found[1], kind
     return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size, comments)
 
 

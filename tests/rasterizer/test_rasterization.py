@@ -9,8 +9,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from lab.numerics.reference import rasterize_reference
 from making import REPOSITORY, camera_askew, splats_in_view
-from pointsplat_ns.rasterizer import rasterization, rasterize_reference
+from pointsplat_ns.rasterizer import rasterization
 
 F64 = torch.float64
 

@@ -1,5 +1,6 @@
 """Kernels, memory and threads."""
 
+import math
 import os
 import subprocess
 import sys
@@ -163,14 +164,15 @@ def machine(root: Path, cgroup: str, **files: str) -> Path:
 def test_quotas_of_control_groups_are_read(tmp_path):
     nested = {"cpu.max": "max 100000", "a/cpu.max": "150000 100000\n", "a/b/cpu.max": "400000 100000"}
     assert cpu_quota(machine(tmp_path / "v2", "0::/a/b\n", **nested)) == 1.5
-    assert cpu_quota(machine(tmp_path / "none", "0::/a\n", **{"a/cpu.max": "max 100000\n"})) is None
+    assert cpu_quota(machine(tmp_path / "none", "0::/a\n", **{"a/cpu.max": "max 100000\n"})) == math.inf
     inside = machine(tmp_path / "container", "0::/as/the/host/sees/it\n", **{"cpu.max": "300000 100000"})
     assert cpu_quota(inside) == 3
-    assert cpu_quota(tmp_path / "another system") is None
-    assert cpu_quota(machine(tmp_path / "broken", "what is this\n2:cpu:/a\n0::/a\n", **{"a/cpu.max": "0 0"})) is None
+    assert cpu_quota(tmp_path / "another system") == math.inf
+    broken = machine(tmp_path / "broken", "what is this\n2:cpu:/a\n0::/a\n", **{"a/cpu.max": "0 0"})
+    assert cpu_quota(broken) == math.inf
 
 
-@pytest.mark.parametrize(("quota", "expected"), [(None, 4), (1.5, 1), (0.2, 1), (3.0, 3), (64.0, 4)])
+@pytest.mark.parametrize(("quota", "expected"), [(math.inf, 4), (1.5, 1), (0.2, 1), (3.0, 3), (64.0, 4)])
 def test_cores_are_those_of_the_affinity_and_the_quota(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 2, 4, 6}, raising=False)
     monkeypatch.setattr("pointsplat_ns.system.cores.cpu_quota", lambda: quota)
