@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import threading
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Literal
 
 import psutil
@@ -56,7 +56,7 @@ Frame = tuple[Cameras, dict[str, Any]]
 """A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""
 
 
-class Frames:
+class Frames(Sequence[Frame]):
     """The posed photos of one split of a dataset: an
     :class:`~pointsplat_ns.nerfstudio_plugin.undistorted.UndistortedDataset`, or another with ``cameras``, a length and
     ``get_data``.
@@ -82,7 +82,7 @@ class Frames:
     def __len__(self) -> int:
         return len(self.dataset)
 
-    def __getitem__(self, index: int) -> Frame:
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
         index = range(len(self))[index]
         key = "photo", self._owner, index
         frame = self.cache.get(key)

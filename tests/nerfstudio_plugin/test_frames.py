@@ -1,6 +1,5 @@
 """Posed photos loaded when due, and what is kept of them in memory."""
 
-import threading
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 WIDTH, HEIGHT = 40, 30
@@ -179,25 +178,3 @@ def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
     setattr(outputs.cameras, name, numbers)
     with pytest.raises(DataError, match="photo1.png: .* frame 1 hold NaN or infinity, as do those of 1 more of 5"):
         UndistortedDataset(outputs)
-
-
-def test_the_bound_holds_while_many_threads_put_and_get():
-    cache = MemoryCache(10)
-    above, wrong = [], []
-
-    def work(seed):
-        for step in range(300):
-            number = (7 * step + seed) % 12
-            cache.put(number, [number, torch.zeros(1 + number % 4, dtype=torch.uint8)])
-            if (size := cache._entries.currsize) > 10:
-                above.append(size)
-            found = cache.get(number)
-            if found is not None and found[0] != number:
-                wrong.append(number)
-
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert (above, wrong) == ([], [])

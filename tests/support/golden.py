@@ -2,7 +2,7 @@
 
 A change of these files needs a reason:
 
-    python tests/support/golden.py --reason "why the pictures change"
+    PYTHONPATH=. python tests/support/golden.py --reason "why the pictures change"
 
 draws them anew and adds the reason, with the hash of the new file, to ``tests/rasterizer/golden.md``. A test compares
 that hash with the file's, so that neither changes alone.

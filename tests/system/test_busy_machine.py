@@ -111,15 +111,6 @@ def test_in_a_container_the_hosts_load_counts_only_where_it_is_full(machine, mon
     assert used() == threads
 
 
-def test_programs_on_cores_that_this_process_may_not_use_do_not_count(monkeypatch):
-    times = psutil.cpu_times(percpu=True)[0]
-    busy, idle = (times._replace(**{name: 0.0 for name in times._fields}) for _ in range(2))
-    busy, idle = busy._replace(user=7.0, system=2.0, idle=1.0), idle._replace(idle=10.0)
-    monkeypatch.setattr(psutil, "cpu_times", lambda percpu: [busy, idle, busy, idle])
-    monkeypatch.setattr(cores_module, "_allowed", lambda: [1, 2, 9])  # a container may be shown fewer than it has
-    assert cores_module._machine() == (2, 9.0)
-
-
 def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypatch):
     def refused(percpu):
         raise PermissionError(13, "Permission denied", "/proc/stat")

@@ -112,34 +112,6 @@ def test_large_tensors_cost_new_pages_once():
     assert after < 0.1 * before
 
 
-THREADS = """
-import ctypes, sys, threading
-from pointsplat_ns.system.memory import share_freed_memory
-shared = sys.argv[1] == "keep" and share_freed_memory()
-libc, all_there = ctypes.CDLL("libc.so.6"), threading.Barrier(6)
-libc.malloc.restype = ctypes.c_void_p
-def work():
-    libc.malloc(60_000)
-    all_there.wait()
-threads = [threading.Thread(target=work) for _ in range(6)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-libc.malloc_stats()  # one line "Arena N:" on standard error for each place to allocate from
-print(shared)
-"""
-
-
-def test_threads_share_the_places_that_they_allocate_from():
-    def places(word: str) -> tuple[bool, int]:
-        done = subprocess.run([sys.executable, "-c", THREADS, word], capture_output=True, text=True, check=True)
-        return done.stdout.strip() == "True", done.stderr.count("Arena ")
-
-    shared, few = places("keep")
-    if not shared:
-        pytest.skip("not Linux with glibc, where there is nothing to do")
-    assert few <= 2 < places("leave")[1]
-
-
 @pytest.mark.parametrize("variable", [None, "7"])
 def test_a_fixed_number_of_threads_holds_for_torch_and_started_programs(monkeypatch, variable):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)

@@ -39,9 +39,6 @@ MODEL_METADATA = (
 )  # fmt: skip
 """Settings of the model in the metadata of a saved network."""
 
-TRAINER_METADATA = ("method_name", "rate_factor", "schedule", "drop_at", "global_norm")
-"""Settings of the trainer in the metadata of a saved network."""
-
 
 @dataclass
 class PointSplatPipelineConfig(VanillaPipelineConfig):
@@ -204,6 +201,7 @@ class PointSplatPipeline(VanillaPipeline):
 
         def save(step: int) -> None:
             trainer = attributes.trainer
+            of_trainer = ("method_name", "rate_factor", "schedule", "drop_at", "global_norm")
             if trainer is not None and processes.rank() == 0:
                 names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
                 save_refiner(
@@ -214,7 +212,7 @@ class PointSplatPipeline(VanillaPipeline):
                         "scenes": ", ".join(names),
                         "supervision": self.datamanager.supervision,
                         **{name: getattr(self.config.model, name) for name in MODEL_METADATA},
-                        **{name: getattr(trainer.config, name) for name in TRAINER_METADATA},
+                        **{name: getattr(trainer.config, name) for name in of_trainer},
                     },
                 )
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
-from torch import nn
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, small_config
@@ -17,7 +16,6 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
 from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner.network import BatchNorm, SubmanifoldConv
 from pointsplat_ns.refiner.weights import read_metadata
 
 PRESETS = {"paper": paper_config, "authors": authors_config}
@@ -74,18 +72,6 @@ def test_each_field_of_a_preset_is_that_of_its_source(name, column):
     optimizers = {part: group["optimizer"] for part, group in trainer.config.optimizers.items()}
     assert {part: optimizer.lr for part, optimizer in optimizers.items()} == {p: v[column] for p, v in BY_PART.items()}
     assert {(o.eps, o.max_norm, o.weight_decay) for o in optimizers.values()} == {((1e-8, 1e-15)[column], None, 0)}
-
-
-@pytest.mark.parametrize(("name", "depths"), [("paper", [2, 2, 2, 4, 2]), ("authors", [2, 2, 2, 6, 2])])
-def test_the_network_of_a_preset_is_that_of_its_source(name, depths):
-    model = PRESETS[name]().pipeline.model
-    network = Refiner(preset(model.size, **model.network_options()), device="meta")
-    assert [len(stage.blocks) for stage in network.backbone.encoder] == depths
-    assert [len(stage.blocks) for stage in network.backbone.decoder] == [2, 2, 2, 2]
-    assert type(network.backbone.embed) is (SubmanifoldConv if name == "paper" else nn.Linear)
-    assert [type(layer) for layer in network.backbone.embed_out] == [BatchNorm, nn.GELU]
-    assert [type(layer) for layer in network.encoder.geometry] == [nn.Linear, BatchNorm, nn.ReLU, nn.Linear]
-    assert network.encoder.gate_gain == 1 and network.heads.means_reach == 1.0
 
 
 def small(name, data, output_dir):
