@@ -124,7 +124,9 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
         mode = None if foreign else _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         require_space(path, target.parent, size)
-        part = (folder or target.parent) / _part_name(target.name)
+        # No other process or thread has this name, on no machine; file systems allow 255 bytes.
+        start = target.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
+        part = (folder or target.parent) / f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
         if mode is not None:
             part.touch(0o600)  # nobody else reads it before it is complete
         yield part
@@ -226,13 +228,6 @@ def _mode_of(path: Path) -> int | None:
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(f"{path}: not a regular file; expected the name of a file to write")
     return stat.S_IMODE(status.st_mode)
-
-
-def _part_name(name: str) -> str:
-    """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is. No other
-    process or thread has it, on no machine that shares the folder."""
-    start = name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-    return f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
 
 
 def json_text(content: Any) -> str:

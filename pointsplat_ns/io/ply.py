@@ -86,6 +86,7 @@ class PlyRows:
         if warn:
             _report_unread(header, vertex, self._in_file, path)
         self._dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
+        self._names = self._dtype.names or ()
         self._start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
         self._parsed = None if header.order else _parsed(path, header, vertex)
         traits = traits_of(header, path)  # who trained with Mip-Splatting's 3D filter trained with antialiasing
@@ -119,10 +120,6 @@ class PlyRows:
         """The Gaussians of single rows, as :meth:`read` gives them."""
         with _opened(self.path) as stream:
             return self._scene(len(rows), lambda these: self._rows(stream, [range(n, n + 1) for n in rows[these]]))
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return self._dtype.names or ()
 
     def _rows(self, stream: io.BufferedReader, ranges: Sequence[range]) -> np.ndarray:
         """Rows in ranges, one after the other. Raises SceneError if the file has become shorter."""
