@@ -47,7 +47,7 @@ def compiled(tmp_path_factory):
         ),
         pytest.param("r * v + sign", "r * v - sign", 1, id="which tiles of a picture"),
         pytest.param("color < 0.0f ? 0.0f : color;", "color;", 1, id="a picture's colour"),
-        pytest.param("static_cast<int64_t>(bits) << 32", "int64_t(0)", 1, id="what is in front"),
+        pytest.param("[drawn++] = static_cast<int64_t>(bits) << 32", "[drawn++] = 0", 1, id="what is in front"),
         pytest.param("+ 2.0f * (h5 * xz) -", "- 2.0f * (h5 * xz) -", 1, id="a colour's gradient"),
         pytest.param("grad_rest + task.ids[row] * task.rest_row", "grad_rest", 1, id="a part's gradient"),
         pytest.param("x + s[5] * dy + sign", "x - s[5] * dy + sign", 1, id="which tiles"),
