@@ -126,12 +126,10 @@ def clean_source(
     looking: Looking,
     picture: str | Path | None = None,
     progress: bool | Progress = False,
-    compared: str = "",
-) -> tuple[Gaussians, Gaussians, float, FullSizeQuality | None]:
+) -> tuple[Gaussians, Gaussians, float, ViewSource]:
     """Read a scene and clean it, as :func:`clean`; results are those of :func:`prune_source`."""
     from pointsplat_ns.compression.cleaning import clean_scene
     from pointsplat_ns.compression.pictures import plot_cleaning
-    from pointsplat_ns.compression.quality import quality_if_seen
     from pointsplat_ns.looking.view_source import VIEW_COUNTS
     from pointsplat_ns.pruning import need_usable
 
@@ -143,14 +141,12 @@ def clean_source(
     with progress_bar(progress) as report:
         cleaning = clean_scene(dense, 1, source, report, strength)
         cleaned = cleaning.apply(dense, 1)
-        seconds, quality = time.perf_counter() - start, None
+        seconds = time.perf_counter() - start
         if picture is not None:
             gone = dense[cleaning.junk.first(len(dense) - 1).indices.to(dense.device)]
             plot_cleaning(dense, gone, cleaned, source.scored(VIEW_COUNTS.scored), picture)
-        if compared:
-            quality = _as_written(lambda scene: quality_if_seen(dense, scene, source.whole), cleaned, compared)
     log(cleaning.notes)
-    return dense, cleaned, seconds, quality
+    return dense, cleaned, seconds, source
 
 
 @normal_mode

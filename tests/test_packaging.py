@@ -117,7 +117,7 @@ def test_installed_package_is_the_one_imported(installed):
 
 @pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++"))), reason="there is no C++ compiler")
 def test_installed_kernels_are_built_and_used(installed):
-    code = "from pointsplat_ns.rasterizer.compiled import KERNELS; print(repr(KERNELS.why_missing))"
+    code = "import pointsplat_ns.rasterizer, pointsplat_ns.system.kernels as k; print(repr(k.KERNELS.why_missing))"
     assert run(installed.python, "-c", code, cwd=installed.folder).strip() == "''"
 
 

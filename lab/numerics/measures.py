@@ -13,6 +13,7 @@ from torch import Tensor
 
 import pointsplat_ns as ps
 from lab.numerics.cases import HEIGHT, WIDTH, Case, Sweep
+from lab.numerics.reference import rasterize_reference
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
@@ -23,7 +24,7 @@ from pointsplat_ns.merging.state import Participants, initial_state
 from pointsplat_ns.pruning.baselines import log_volume_score
 from pointsplat_ns.pruning.paper import paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
-from pointsplat_ns.rasterizer import rasterization, rasterize_reference
+from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.refiner import Refiner
 from pointsplat_ns.refiner.refiner import gaussian_features
 

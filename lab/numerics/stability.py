@@ -21,7 +21,7 @@ from lab.common.results import write_json
 from lab.numerics.cases import SWEEPS
 from lab.numerics.measures import Row, measured
 from lab.numerics.report import TRUSTED, plot, tables
-from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.progress import tracked
 
 

@@ -292,7 +292,7 @@ def _use_replica(path: Path) -> object:
     from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 
     scene = load_replica(path.parent)
-    return scene, scene.params.principal_point()
+    return scene, scene.params.principal_point
 
 
 READERS |= {

@@ -15,7 +15,7 @@ from torch import Tensor
 from lab.rooms.render import default_intrinsics, render_room
 from lab.rooms.room import Room, make_room
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import lack_of_room, read_text
+from pointsplat_ns.io.files import read_text
 from pointsplat_ns.system.progress import Progress, tracked
 
 
@@ -98,8 +98,7 @@ def write_room(
         (partial / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1) + "\n", encoding="utf-8")
         os.replace(partial, folder)
     except OSError as error:
-        why = f"{error.strerror or error}{lack_of_room(error, partial)}"
-        raise DataError(f"{folder}: cannot be written ({why})") from error
+        raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return folder

@@ -214,10 +214,8 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns.cli.help import after_help
         from pointsplat_ns.cli.printing import only_json
         from pointsplat_ns.cli.scene_options import claims_until_the_end, quantities
-        from pointsplat_ns.system.memory import keep_freed_memory, require_room_for_torch
+        from pointsplat_ns.system.memory import keep_freed_memory
 
-        if not {"--version", "--help", "-h"} & {*args}:
-            require_room_for_torch()
         keep_freed_memory()
         _ignore_matplotlibrc()
         level = logging.DEBUG if "--verbose" in args else logging.INFO

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
@@ -25,7 +24,8 @@ def clean(
     """Remove floaters, and what cannot be drawn or is seen from nowhere.
 
     Args:
-        output: file to write: .ply, .spz, .sog, .splat, .glb; by default room_clean.ply beside room.ply.
+        output: file to write: .ply, .spz, .sog, .splat, .glb; by default in the format of the scene and
+            beside it: room_clean.ply for room.ply.
         strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
             hardly change. 0 removes only what cannot be drawn or seen.
         picture: a .png file that shows, in three views, the scene, what goes in a colour for each cluster, and the
@@ -34,6 +34,7 @@ def clean(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import Looking, clean_source
+    from pointsplat_ns.compression.quality import quality_of_file
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.system.threads import fixed_threads
 
@@ -43,10 +44,12 @@ def clean(
     options.claim_outputs(output, force, picture)
     looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).budget_suffix
     with fixed_threads(threads):
-        dense, cleaned, seconds, quality = clean_source(scene, strength, looking, picture, True, suffix)
+        dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
         ps.save(cleaned, output, progress=True, overwrite=True)
+        with options.scene_written(output):
+            quality = quality_of_file(dense, source, cleaned, output, suffix)
     if json_output:
-        compared = asdict(quality) if quality else {"psnr": None}
+        compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})
         return
     print_result("clean", [], len(dense), cleaned, seconds, output, quality)

@@ -15,7 +15,6 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import file_stem, logger
 from pointsplat_ns.io.formats import READABLE, format_named, format_to_read
 from pointsplat_ns.io.ply import read_ply
-from pointsplat_ns.io.ply_dialects import with_plain_names
 from pointsplat_ns.io.ply_header import read_header
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run, scene_name
 from pointsplat_ns.io.scene import is_folder_of_scenes, is_scene_file
@@ -260,7 +259,7 @@ def _why_none(path: Path) -> str:
         return ""
     try:
         with path.open("rb") as stream:
-            header = with_plain_names(read_header(stream, path))
+            header = read_header(stream, path)
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     except SceneError:

@@ -124,7 +124,9 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
         mode = None if foreign else _mode_of(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         require_space(path, target.parent, size)
-        part = (folder or target.parent) / _part_name(target.name)
+        # No other process or thread has this name, on no machine; file systems allow 255 bytes.
+        start = target.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
+        part = (folder or target.parent) / f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
         if mode is not None:
             part.touch(0o600)  # nobody else reads it before it is complete
         yield part
@@ -133,7 +135,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
         (_put_new if path in _NEVER_REPLACED.get() else os.replace)(part, target)
     except OSError as error:
         why = error.strerror or one_line(error)
-        raise SceneError(f"{path}: cannot be written ({why}{lack_of_room(error, part)})") from error
+        raise SceneError(f"{path}: cannot be written ({why})") from error
     finally:
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
@@ -194,18 +196,6 @@ def require_space(path: Path, folder: Path, size: int) -> None:
         )
 
 
-def lack_of_room(error: OSError, part: Path | None) -> str:
-    """Hint for an error of writing an unfinished file or folder, if the disk has no room for it; else an empty text."""
-    if part is None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return ""
-    try:
-        written = sum(file.stat().st_size for file in (part, *part.rglob("*")) if file.is_file())
-        free = shutil.disk_usage(part.parent).free if error.errno == errno.ENOSPC else 0
-    except OSError:
-        return ""
-    return f"; it needs more than {bytes_text(written + free)}; make room or name another place"
-
-
 def bytes_text(size: float) -> str:
     """A number of bytes in kB, MB or GB of 1000, to three digits.
 
@@ -240,13 +230,6 @@ def _mode_of(path: Path) -> int | None:
     return stat.S_IMODE(status.st_mode)
 
 
-def _part_name(name: str) -> str:
-    """A name for the unfinished file, no longer than file systems allow (255 bytes), however long ``name`` is. No other
-    process or thread has it, on no machine that shares the folder."""
-    start = name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-    return f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
-
-
 def json_text(content: Any) -> str:
     """JSON of numbers, text, paths and collections of them, with null for numbers that JSON does not have.
 
@@ -274,22 +257,18 @@ def _without_infinities(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-_FORMULA = tuple("=+-@\t\r\n\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SIGN}\N{FULLWIDTH HYPHEN-MINUS}") + (
-    "\N{FULLWIDTH COMMERCIAL AT}",
-)
-"""Signs by which spreadsheets tell a formula, which may send what stands in other cells (OWASP, CSV injection)."""
-
-
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write rows of the same columns to a CSV file, as :func:`replacing` writes what no person named.
 
-    A text that a spreadsheet would take for a formula gets a leading apostrophe, as a file's name may be a stranger's.
+    A text that spreadsheets would take for a formula, which may send what stands in other cells (OWASP, CSV injection),
+    gets a leading apostrophe: a file's name may be a stranger's.
     """
+    formula = tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
     with replacing(path, named=False) as part, part.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
         writer.writeheader()
         for row in rows:
-            texts = {name for name, value in row.items() if isinstance(value, str) and value.startswith(_FORMULA)}
+            texts = {name for name, value in row.items() if isinstance(value, str) and value.startswith(formula)}
             writer.writerow({name: f"'{value}" if name in texts else value for name, value in row.items()})
 
 

@@ -28,7 +28,6 @@ from pointsplat_ns.io.ply_dialects import (
     columns_of,
     has_plain_colors,
     is_flat,
-    with_plain_names,
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
@@ -78,7 +77,7 @@ class PlyRows:
     def __init__(self, path: Path | str, warn: bool = True, whole: bool = False):
         self.path = path = require_file(path, "a 3DGS PLY file")
         with _opened(path) as stream:
-            header = with_plain_names(read_header(stream, path))
+            header = read_header(stream, path)
         vertex = _gaussian_element(header, path)
         self.count, self._in_file = vertex.count, _num_rest(vertex, path)
         self.rest = min(self._in_file, MAX_REST)
@@ -87,6 +86,7 @@ class PlyRows:
         if warn:
             _report_unread(header, vertex, self._in_file, path)
         self._dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
+        self._names = self._dtype.names or ()
         self._start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
         self._parsed = None if header.order else _parsed(path, header, vertex)
         traits = traits_of(header, path)  # who trained with Mip-Splatting's 3D filter trained with antialiasing
@@ -120,10 +120,6 @@ class PlyRows:
         """The Gaussians of single rows, as :meth:`read` gives them."""
         with _opened(self.path) as stream:
             return self._scene(len(rows), lambda these: self._rows(stream, [range(n, n + 1) for n in rows[these]]))
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return self._dtype.names or ()
 
     def _rows(self, stream: io.BufferedReader, ranges: Sequence[range]) -> np.ndarray:
         """Rows in ranges, one after the other. Raises SceneError if the file has become shorter."""

@@ -7,16 +7,13 @@ with; the filter belongs to the scene, and its own ``create_fused_ply.py`` fuses
 
 from __future__ import annotations
 
-import re
 from collections.abc import Container
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.ply_header import Header
 
 Table = NDArray[np.float32]
 
@@ -32,23 +29,6 @@ COLUMNS = {
 
 COLORS = ["red", "green", "blue"]
 FILTER = "filter_3D"
-
-_PREFIXED = re.compile(r"(?:scalar_)?(?:scal_)?(f_dc_\d|f_rest_\d+|opacity|scale_\d|rot_\d|filter_3D)")
-
-
-def with_plain_names(header: Header) -> Header:
-    """A header whose vertex properties have the names of 3DGS, without prefixes, but for names that it has already."""
-    elements = []
-    for element in header.elements:
-        names = {name for name, _ in element.properties}
-        properties = []
-        for name, kind in element.properties:
-            found = _PREFIXED.fullmatch(name) if element.name == "vertex" else None
-            plain = name if found is None or found[1] in names else found[1]
-            names.add(plain)
-            properties.append((plain, kind))
-        elements.append(replace(element, properties=tuple(properties)))
-    return replace(header, elements=tuple(elements))
 
 
 def is_flat(names: Container[str]) -> bool:

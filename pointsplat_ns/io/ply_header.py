@@ -20,9 +20,6 @@ from pointsplat_ns.geometry.transforms import AXES
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.offsets import offset_of_text, offset_text
 
-MAX_HEADER_BYTES = 1 << 20
-"""A 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold."""
-
 _TYPES = {
     "char": "int8", "int8": "int8", "uchar": "uint8", "uint8": "uint8",
     "short": "int16", "int16": "int16", "ushort": "uint16", "uint16": "uint16",
@@ -31,11 +28,6 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-
-ANTIALIASED = "SplatRenderMode: mip"
-"""The comment of a scene that was trained with antialiasing, as Brush and splat-transform write it."""
-UP = "Vertical Axis: "
-"""The start of the comment that names the up axis, as nerfstudio writes it."""
 OFFSET = "Offset: "
 """The start of the comment with the offset of positions: three numbers that are added to x, y and z."""
 
@@ -88,8 +80,9 @@ class Header:
 
 
 def read_header(stream: BinaryIO, path: Path) -> Header:
-    """Parse the header at the start of ``stream``, which is left at an unspecified position. Raises SceneError if it is
-    not a PLY header, has no end, or has a line that is not valid PLY."""
+    """Parse the header at the start of ``stream``, which is left at an unspecified position. Vertex properties have the
+    names of 3DGS, without prefixes. Raises SceneError if it is not a PLY header, has no end, or has a line that is not
+    valid PLY."""
     text, size = _header_text(stream, path)
     order: str | None = None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
@@ -121,12 +114,20 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     _reject_duplicates([name for name, _, _ in elements], "element", path)
     for name, _, properties in elements:
         _reject_duplicates([prop for prop, _ in properties], f"{name} property", path)
+        names = {prop for prop, _ in properties}
+        prefixed = r"(?:scalar_)?(?:scal_)?(f_dc_\d|f_rest_\d+|opacity|scale_\d|rot_\d|filter_3D)"  # by CloudCompare
+        for index, (prop, kind) in enumerate(properties):
+            found = re.fullmatch(prefixed, prop) if name == "vertex" else None
+            if found and found[1] not in names:  # nor a second one with another prefix
+                names.add(found[1])
+                properties[index] = found[1], kind
     return Header(order, tuple(Element(name, count, tuple(props)) for name, count, props in elements), size, comments)
 
 
 def first_lines(traits: Traits) -> list[str]:
-    """The lines of a header before its elements."""
-    comments = [ANTIALIASED] * traits.antialiased + ([] if traits.up is None else [UP + traits.up])
+    """The lines of a header before its elements. Comments are those that :func:`traits_of` reads."""
+    comments = ["SplatRenderMode: mip"] * traits.antialiased
+    comments += [] if traits.up is None else [f"Vertical Axis: {traits.up}"]
     comments += [] if traits.offset is None else [OFFSET + offset_text(traits.offset)]
     return ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
 
@@ -135,8 +136,8 @@ def traits_of(header: Header, path: Path) -> Traits:
     """The traits of a scene that a header's comments declare; the last comment on each counts. Ways of rendering other
     than ordinary and antialiased are warned of.
 
-    Brush writes ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or ``1``, nerfstudio
-    ``Vertical Axis: z``.
+    Brush and splat-transform write ``SplatRenderMode: default``, ``mip`` or ``2dgs``, Postshot ``antialiased 0`` or
+    ``1``, nerfstudio ``Vertical Axis: z``.
     """
     found, up, offset = False, None, None
     for comment in header.comments:
@@ -158,14 +159,15 @@ def traits_of(header: Header, path: Path) -> Traits:
 
 def _header_text(stream: BinaryIO, path: Path) -> tuple[list[str], int]:
     """Lines of the header up to ``end_header``, and the number of bytes they take."""
-    start = stream.read(MAX_HEADER_BYTES)
+    most = 1 << 20  # a 3DGS header has about 1.5 kB; comments may make it longer, but not by a thousandfold
+    start = stream.read(most)
     if start[:4] not in (b"ply\n", b"ply\r"):
         raise SceneError(f"{path}: not a PLY file (starts with {start[:4]!r}); expected the line 'ply'")
     newline = b"\n" if start[3:4] == b"\n" else b"\r\n" if start[4:5] == b"\n" else b"\r"
     # Some programs write spaces after the keyword. The newline may be missing where nothing follows.
     found = re.compile(newline + rb"end_header[ \t]*(" + newline + rb"|\Z)").search(start)
     if found is None:
-        why = "is truncated" if len(start) < MAX_HEADER_BYTES else f"is longer than {MAX_HEADER_BYTES} bytes"
+        why = "is truncated" if len(start) < most else f"is longer than {most} bytes"
         raise SceneError(f"{path}: PLY header {why}; no line 'end_header' found")
     return start[: found.start()].decode("latin-1").split(newline.decode()), found.end()
 

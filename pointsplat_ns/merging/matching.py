@@ -4,13 +4,12 @@ torch."""
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.merging.settings import MERGING
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import FLAGS, INDICES
 from pointsplat_ns.system.threads import most_threads
 
@@ -108,6 +107,7 @@ def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tenso
     return first, second, price
 
 
+@KERNELS.tried_by
 def _as_torch() -> bool:
     """Whether the kernels find some pairs as torch does."""
     generator = torch.Generator().manual_seed(0)
@@ -116,6 +116,3 @@ def _as_torch() -> bool:
     costs = torch.randint(9, (200, 6), generator=generator, device="cpu").float()  # many of them equal
     found = [function(near, costs.clone(), 4) for function in (_by_kernels, _candidates)]
     return all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
-KERNELS = Kernels("merging", Path(__file__).with_name("matching.cpp"), _as_torch)

@@ -36,7 +36,6 @@ products of four of them. A compiled kernel (``pair_cost.cpp``) computes costs w
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -46,7 +45,7 @@ from pointsplat_ns.merging.covariance import pack, plane_axes
 from pointsplat_ns.merging.replacement import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
 
@@ -213,6 +212,7 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     return costs
 
 
+@KERNELS.tried_by
 def _as_torch() -> bool:
     """Whether the kernels compute the costs of some pairs as torch does."""
     generator = torch.Generator().manual_seed(0)
@@ -230,6 +230,3 @@ def _as_torch() -> bool:
     near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32, device="cpu")
     ours, torchs = _by_kernels(state, near, MERGING), pair_costs(state, near, compiled=False)
     return agreement([ours], [torchs], off=1e-4, share=1e-2)
-
-
-KERNELS = Kernels("merging", Path(__file__).with_name("pair_cost.cpp"), _as_torch)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -29,7 +28,7 @@ from pointsplat_ns.merging.groups import Groups, first_members
 from pointsplat_ns.merging.replacement import enlarged
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, bounded_colours
-from pointsplat_ns.system.kernels import SEVERAL, Kernels, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
 from pointsplat_ns.system.threads import most_threads
@@ -249,6 +248,7 @@ def _by_kernels(piece: Piece, group: Tensor, near: Tensor, fits: Fits) -> Tensor
     return best
 
 
+@KERNELS.tried_by
 def _as_torch() -> bool:
     """Whether the kernel chooses the groups of some members as torch does."""
     generator = torch.Generator().manual_seed(0)
@@ -261,6 +261,3 @@ def _as_torch() -> bool:
     group, near = (torch.randint(9, shape, generator=generator, device="cpu") for shape in ((90,), (90, 4)))
     torchs = fits.best_of(piece, torch.cat([group[:, None], near], dim=1))
     return torch.equal(_by_kernels(piece, group, near.int(), fits), torchs)
-
-
-KERNELS = Kernels("merging", Path(__file__).with_name("regrouping.cpp"), _as_torch)

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import functools
 import math
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import Kernels, agreement, on_threads
+from pointsplat_ns.system.kernels import KERNELS, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 SSIM_WINDOW = 11
@@ -129,6 +128,7 @@ def _call(
     on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
 
 
+@KERNELS.tried_by
 def _as_torch() -> bool:
     """Whether the kernel gives the similarity of some images and its gradient as torch does."""
     generator = torch.Generator().manual_seed(0)
@@ -140,6 +140,3 @@ def _as_torch() -> bool:
             value = function(leaf.permute(0, 3, 1, 2), (0.6 * image + 0.4 * noise).permute(0, 3, 1, 2))
         found.append((value.detach(), *torch.autograd.grad(value, leaf)))
     return agreement(found[0], found[1], off=1e-4, share=1e-2)
-
-
-KERNELS = Kernels("SSIM", Path(__file__).with_name("structural_similarity.cpp"), _as_torch)

@@ -14,7 +14,7 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import use_gsplat
-from pointsplat_ns.rasterizer.compiled import blending
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views
 
@@ -41,7 +41,7 @@ class RasterizerOptions:
         if device.type != "cpu":
             return "rasterizer: torch"
         off = self.compiled is False
-        why = "as --pipeline.model.compiled is False" if off else blending.KERNELS.why_missing
+        why = "as --pipeline.model.compiled is False" if off else KERNELS.why_missing
         return (
             f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
         )

@@ -88,8 +88,7 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
         return self._frames_of(self.eval_dataset)
 
     def _frames_of(self, dataset: UndistortedDataset) -> Frames:
-        workers = self.config.max_thread_workers or 2
-        return Frames(dataset, self.config.cache_images_type, self.frame_cache, workers, self.device)
+        return Frames(dataset, self.config.cache_images_type, self.frame_cache, self.device)
 
     @property
     def fixed_indices_eval_dataloader(self) -> Frames:  # type: ignore[override]  # nerfstudio's is a list
@@ -108,7 +107,6 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSourc
         if not self.train_unseen_cameras:
             self.train_unseen_cameras = self.sample_train_cameras()
         camera, data = self.train_frames[index]
-        self.train_frames.prefetch(self.train_unseen_cameras[: self.train_frames.look_ahead])
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, data
 

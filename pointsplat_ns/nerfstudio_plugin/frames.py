@@ -5,9 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import threading
-from collections.abc import Hashable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Literal
 
 import psutil
@@ -28,11 +26,6 @@ class MemoryCache:
     def of(cls, gigabytes: float | None = None) -> MemoryCache:
         """A cache of this size, 10^9 bytes; by default of a quarter of the memory that is free now."""
         return cls(psutil.virtual_memory().available // 4 if gigabytes is None else int(gigabytes * 1e9))
-
-    @property
-    def num_bytes(self) -> int:
-        """Total size of the values, bytes."""
-        return int(self._entries.currsize)
 
     def get(self, key: Hashable) -> Any:
         """The value of ``key``, which then counts as just used; None if there is none."""
@@ -63,7 +56,7 @@ Frame = tuple[Cameras, dict[str, Any]]
 """A camera of shape (1,), and what nerfstudio calls its data: a dictionary with the photo, its mask and its index."""
 
 
-class Frames:
+class Frames(Sequence[Frame]):
     """The posed photos of one split of a dataset: an
     :class:`~pointsplat_ns.nerfstudio_plugin.undistorted.UndistortedDataset`, or another with ``cameras``, a length and
     ``get_data``.
@@ -71,64 +64,31 @@ class Frames:
     ``frames[i]`` is ``(camera, data)``: a nerfstudio camera of shape (1,) without lens distortion, and a fresh
     dictionary with ``image`` (H, W, 3 or 4; uint8 or float32 in [0, 1]), ``mask`` (H, W, 1) bool where the dataset has
     masks, and ``image_idx``, all on ``device``. The tensors are shared with the cache, which by default takes a quarter
-    of the free memory: do not write to them. ``max_workers`` threads decode ahead, if any. A photo or mask that cannot
-    be used is a DataError.
+    of the free memory: do not write to them. A photo or mask that cannot be used is a DataError.
     """
-
-    look_ahead = 4
-    """Photos decoded ahead of the one in use: enough to hide decoding behind a training step, few enough to need little
-    memory."""
 
     def __init__(
         self,
         dataset: Any,
         image_type: Literal["uint8", "float32"] = "uint8",
         cache: MemoryCache | None = None,
-        max_workers: int = 2,
         device: torch.device | str = "cpu",
     ):
         self.dataset, self.device = dataset, device
         self.image_type: Literal["uint8", "float32"] = image_type
         self.cache = MemoryCache.of() if cache is None else cache
         self._owner = object()
-        self._pool = ThreadPoolExecutor(max_workers, "frames") if max_workers > 0 else None  # starts threads when used
-        self._loading: dict[int, Future[Frame]] = {}
-        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self.dataset)
 
-    def __getitem__(self, index: int) -> Frame:
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
         index = range(len(self))[index]
-        with self._lock:
-            loading = self._loading.get(index)
-        frame = loading.result() if loading is not None else self.cache.get(("photo", self._owner, index))
-        camera, data = self._load(index) if frame is None else frame
+        key = "photo", self._owner, index
+        frame = self.cache.get(key)
+        if frame is None:
+            frame = self.dataset.cameras[index : index + 1], self.dataset.get_data(index, image_type=self.image_type)
+            self.cache.put(key, frame)
+        camera, data = frame
         moved = {name: data[name].to(self.device) for name in ("image", "mask") if name in data}
         return copy.deepcopy(camera).to(self.device), {**data, **moved}
-
-    def __iter__(self) -> Iterator[Frame]:
-        for index in range(len(self)):
-            self.prefetch(range(index + 1, min(index + 1 + self.look_ahead, len(self))))
-            yield self[index]
-
-    def prefetch(self, indices: Iterable[int]) -> None:
-        """Start decoding photos that will be needed soon. An error is raised when the photo is asked for."""
-        if self._pool is None:
-            return
-        for index in indices:
-            with self._lock:
-                if index in self._loading or self.cache.get(("photo", self._owner, index)) is not None:
-                    continue
-                self._loading[index] = future = self._pool.submit(self._load, index)
-            future.add_done_callback(partial(self._forget, index))
-
-    def _forget(self, index: int, _: Future[Frame]) -> None:
-        with self._lock:
-            self._loading.pop(index, None)
-
-    def _load(self, index: int) -> Frame:
-        data = self.dataset.get_data(index, image_type=self.image_type)
-        frame = self.dataset.cameras[index : index + 1], data
-        self.cache.put(("photo", self._owner, index), frame)
-        return frame

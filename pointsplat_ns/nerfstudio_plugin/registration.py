@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import importlib
-import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -17,19 +16,6 @@ from pointsplat_ns.errors import PointSplatError
 
 JIT_SCRIPT = "ignore:`torch.jit.script` is deprecated:FutureWarning:torch.jit._script"
 """Value of the environment variable PYTHONWARNINGS that hides a warning: nerfstudio scripts a function at import."""
-
-NERFSTUDIO = (
-    # Decorators of nerfstudio's NeRF methods, at import.
-    ("`torch.cuda.amp.custom_fwd(args...)` is deprecated", FutureWarning, "nerfstudio.field_components.activations"),
-    ("`torch.cuda.amp.custom_bwd(args...)` is deprecated", FutureWarning, "nerfstudio.field_components.activations"),
-    # The trainer's constructor.
-    ("`torch.cuda.amp.GradScaler(args...)` is deprecated", FutureWarning, "nerfstudio.engine.trainer"),
-    # Losses are written to the log with their graph.
-    ("Converting a tensor with requires_grad=True to a scalar", UserWarning, "nerfstudio.utils.writer"),
-    # The standard deviation over a single held-out photo, which the evaluation then reports as None.
-    ("std_mean(): degrees of freedom is <= 0", UserWarning, "nerfstudio.pipelines.base_pipeline"),
-)
-"""Warnings of nerfstudio's modules that a user can do nothing about: beginning of the text, category, module."""
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
@@ -62,9 +48,10 @@ def errors_in_one_line() -> None:
 
 
 def quiet_nerfstudio() -> None:
-    """Ignore the warnings in :data:`NERFSTUDIO`, and no others, from now on in this process."""
-    for text, category, module in NERFSTUDIO:
-        warnings.filterwarnings("ignore", re.escape(text), category, re.escape(module) + r"\Z")
+    """Ignore warnings that torch and Python raise for nerfstudio's own modules, from now on in this process: a user can
+    do nothing about them."""
+    for category in (FutureWarning, UserWarning):
+        warnings.filterwarnings("ignore", category=category, module=r"nerfstudio\.")
 
 
 def import_nerfstudio() -> None:

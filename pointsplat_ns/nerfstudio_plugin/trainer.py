@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import signal
 import sys
 import threading
@@ -11,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
@@ -24,7 +22,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from pointsplat_ns.errors import DataError, PointSplatError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.runs import step_of
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
@@ -51,35 +49,11 @@ class StoppableTrainerConfig(TrainerConfig):
     variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all, and in a folder of its own (:meth:`take_folder`)."""
-        self.take_folder()
+        """As nerfstudio's, but whole or not at all. Raises SceneError if it cannot be written."""
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         with replacing(path) as part:
             part.write_text(yaml.dump(self), "utf-8")
-
-    def take_folder(self) -> None:
-        """Make the folder of the run. If there is one of that name, as of a training that was started in the same
-        second, change the timestamp: two trainings in one folder would replace each other's files. A training that
-        resumes from a checkpoint in its own folder stays there. Raises PointSplatError if no folder can be made."""
-        given = self.get_base_dir()
-        resumed = self.load_dir or (self.load_checkpoint and self.load_checkpoint.parent)
-        if resumed is not None and resumed.resolve() == self.get_checkpoint_dir().resolve():
-            return
-        timestamp = self.timestamp
-        try:
-            given.parent.mkdir(parents=True, exist_ok=True)
-            for number in itertools.count(2):
-                with suppress(FileExistsError):
-                    self.get_base_dir().mkdir()
-                    break
-                self.timestamp = f"{timestamp}_{number}"
-        except OSError as error:
-            raise PointSplatError(
-                f"{given}: cannot be made as the folder of this training ({error.strerror}); name another --output-dir"
-            ) from error
-        if self.timestamp != timestamp:
-            CONSOLE.log(f"{given} is the folder of another training; this one gets {self.get_base_dir()}")
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or the step in the name of the checkpoint that it resumes from."""
@@ -90,13 +64,13 @@ class StoppableTrainerConfig(TrainerConfig):
 
 
 class StoppableTrainer(Trainer):
-    """nerfstudio's trainer. It removes the run folder if the input cannot be used, and reuses freed memory on a CPU.
+    """nerfstudio's trainer. It reuses freed memory on a CPU.
 
     Steps on a CPU use as many threads as other programs leave cores
     (:func:`~pointsplat_ns.system.threads.suitable_threads`).
 
-    Checkpoints and the other files of a run are written beside and renamed, so that one that is there is whole,
-    however the training ended.
+    Checkpoints and the config are written beside and renamed, so that one that is there is whole, however the training
+    ended.
 
     Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
     interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
@@ -119,37 +93,19 @@ class StoppableTrainer(Trainer):
         self._skipped_in_a_row = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """As nerfstudio's. If the data or a number of steps cannot be used, the run folder, which then holds only the
-        config, is removed before the PointSplatError."""
+        """As nerfstudio's; a line of the log names the rasterizer."""
         if torch.device(self.device).type == "cpu":
             keep_freed_memory()
         try:
-            if self.config.max_num_iterations < 1:
-                raise PointSplatError(
-                    f"--max-num-iterations {self.config.max_num_iterations}: expected at least 1; a run is shown and "
-                    "measured without a training by ns-viewer, ns-render and ns-eval"
-                )
             super().setup(test_mode)
             model = self.config.pipeline.model
             if self.local_rank == 0 and isinstance(model, RasterizerOptions):
                 CONSOLE.log(model.engine(torch.device(self.device)))
-        except PointSplatError:
-            self._withdraw()
-            raise
         except KeyboardInterrupt:
             _interrupted(signal.SIGINT)
         if self.local_rank == 0:
             # nerfstudio takes the steps of this call for the last step, also where a training resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
-        outputs = getattr(self.pipeline.datamanager, "train_dataparser_outputs", None)
-        if outputs is not None:
-            save = outputs.save_dataparser_transform
-
-            def save_whole(path: Path) -> None:
-                with replacing(path) as part:
-                    save(part)
-
-            outputs.save_dataparser_transform = save_whole
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
 
@@ -158,10 +114,7 @@ class StoppableTrainer(Trainer):
         and ends with 0, as if it had finished. Raises PointSplatError if the number of threads is below 1."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
-                try:
-                    super().train()
-                finally:
-                    self.end_background()
+                super().train()
             except KeyboardInterrupt:
                 if self._between_steps and self.step > self._start_step:
                     self.save_checkpoint(self.step - 1)
@@ -170,9 +123,6 @@ class StoppableTrainer(Trainer):
                         f"{self.checkpoint_dir}"
                     )
                 _interrupted(self._asked or signal.SIGINT)
-
-    def end_background(self) -> None:
-        """End what a training does beside its steps; by default there is nothing."""
 
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open after the last step until Ctrl-C or SIGTERM. The training is complete: they end it as
@@ -323,17 +273,6 @@ class StoppableTrainer(Trainer):
         if self._asked is not None:
             self._between_steps = True
             raise KeyboardInterrupt
-
-    def _withdraw(self) -> None:
-        """Remove the run folder, and those above it that hold nothing else, if it holds only the config."""
-        config = self.base_dir / "config.yml"
-        if not config.is_file() or list(self.base_dir.iterdir()) != [config]:
-            return
-        config.unlink()
-        for folder in (self.base_dir, *self.base_dir.parents):
-            if folder == Path(self.config.output_dir).parent or any(folder.iterdir()):
-                break
-            folder.rmdir()
 
 
 def all_finite(tensors: Any) -> bool:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
-from pointsplat_ns.rasterizer.compiled import KERNELS, blending
+from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
 from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK, TILE
@@ -23,7 +23,7 @@ from pointsplat_ns.rasterizer.projection import camera_of, count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.rasterizer.rendering import Colors, rasterization
 from pointsplat_ns.rasterizer.tiles import Region
-from pointsplat_ns.system.kernels import SEVERAL, agreement, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, agreement, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.compiled import projection as by_kernels
 from pointsplat_ns.rasterizer.ewa import Lens, Project
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.views import EPS2D, View, Views
 
 

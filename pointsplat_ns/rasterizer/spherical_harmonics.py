@@ -9,8 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.geometry.harmonics import C1, C2, C3, SH_C0, basis_rows
 from pointsplat_ns.geometry.transforms import unit_rows
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.compiled.colors import CompiledColor
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.tensors import full_precision
 
 

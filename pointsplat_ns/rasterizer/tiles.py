@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.compiled import tiles as by_kernels
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, TILE
 from pointsplat_ns.rasterizer.ellipses import Grid
 from pointsplat_ns.rasterizer.ellipses import Region as Region  # part of this module's interface, as the next
 from pointsplat_ns.rasterizer.ellipses import TileList as TileList
 from pointsplat_ns.rasterizer.projection import Projected
+from pointsplat_ns.system.kernels import KERNELS
 
 
 def _by_depth(depths: Tensor) -> Tensor:

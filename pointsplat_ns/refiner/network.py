@@ -53,9 +53,8 @@ def layer_norm(channels: int) -> nn.LayerNorm:
 class BatchNorm(nn.BatchNorm1d):
     """Batch norm over points: ``[N, C] -> [N, C]``.
 
-    It differs from torch's in two ways. A single point, which has no variance, uses the running statistics. And the
-    running statistics start as plain averages, until the momentum exceeds one over the number of steps; otherwise their
-    initial values would still count after a short training.
+    Unlike in torch's, a single point, which has no variance, uses running statistics. These start as averages, until
+    the momentum exceeds one over the number of steps: after a short training, initial values do not count.
     """
 
     def __init__(self, channels: int):

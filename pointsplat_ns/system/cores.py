@@ -8,21 +8,12 @@ import os
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
-
-
-class Group(NamedTuple):
-    """A control group of Linux that limits cores."""
-
-    quota: float  # cores
-    folder: Path
 
 
 def cores() -> int:
     """Number of cores that this process may use: as its affinity and the quotas of its control groups (those of a
     container, for one) allow."""
-    allowed, quota = len(_allowed()), cpu_quota()
-    return allowed if quota is None else max(1, min(allowed, int(quota)))
+    return max(1, int(min(len(_allowed()), cpu_quota())))
 
 
 def _allowed() -> list[int]:
@@ -37,24 +28,18 @@ class OtherPrograms:
         self._before = self._read()
 
     @staticmethod
-    def _read() -> tuple[float, float, list[tuple[float, float]]]:
-        """Seconds of the clock and of this process on cores, and of each limit its cores and the seconds that all
-        processes have used of them."""
-        groups = [(group.quota, _seconds_of(group.folder)) for group in limiting_groups()]
-        return time.monotonic(), time.process_time(), [_machine(), *groups]
+    def _read() -> tuple[float, float, float, float]:
+        """Seconds of the clock and of this process on cores, and what :func:`_machine` tells."""
+        return time.monotonic(), time.process_time(), *_machine()
 
     def cores(self) -> float:
         """Mean number of cores, at most :func:`cores`. What others use of a machine counts only where the rest is less
         than a quota allows this process."""
-        (start, own_before, before), (end, own_after, after) = self._before, self._read()
+        (start, own_before, _, before), (end, own_after, limit, after) = self._before, self._read()
         if end <= start:
             return 0.0
-        own = own_after - own_before
-        left = min(
-            limit - max(0.0, now - then - own) / (end - start)
-            for (limit, now), (_, then) in zip(after, before, strict=True)
-        )
-        return min(max(0.0, cores() - left), float(cores()))
+        others = max(0.0, after - before - (own_after - own_before)) / (end - start)
+        return min(max(0.0, cores() - (limit - others)), float(cores()))
 
 
 def _machine() -> tuple[float, float]:
@@ -103,21 +88,15 @@ free_cores = FreeCores()
 """One for the process, so that looks are not repeated."""
 
 
-def cpu_quota(root: Path = Path("/")) -> float | None:
-    """Number of cores that Linux's control groups allow this process, the least of its group and all above; None if
-    there is no limit. ``root`` as for :func:`limiting_groups`."""
-    return min((group.quota for group in limiting_groups(root)), default=None)
-
-
 @functools.cache
-def limiting_groups(root: Path = Path("/")) -> tuple[Group, ...]:
-    """Linux's control groups (version 2) that limit the cores of this process: its group and those above. ``proc`` and
-    ``sys`` are below ``root``."""
+def cpu_quota(root: Path = Path("/")) -> float:
+    """Number of cores that Linux's control groups (version 2) allow this process, the least of its group and all above;
+    infinite if there is no limit. ``proc`` and ``sys`` are below ``root``."""
     try:
         lines = (root / "proc/self/cgroup").read_text("utf-8").splitlines()
     except OSError:
-        return ()
-    top, found = root / "sys/fs/cgroup", []
+        return math.inf
+    top, least = root / "sys/fs/cgroup", math.inf
     for line in lines:
         if line.startswith("0::/"):
             folder = top / line[4:]
@@ -125,15 +104,7 @@ def limiting_groups(root: Path = Path("/")) -> tuple[Group, ...]:
             for each in (folder, *folder.parents):
                 with suppress(OSError, ValueError, ZeroDivisionError):  # "max": no limit
                     quota, period = (each / "cpu.max").read_text("utf-8").split()
-                    found.append(Group(int(quota) / int(period), each))
+                    least = min(least, int(quota) / int(period))
                 if each == top:
                     break
-    return tuple(found)
-
-
-def _seconds_of(folder: Path) -> float:
-    """CPU time that a control group has used, seconds; 0 if it does not say."""
-    with suppress(OSError, ValueError, IndexError):
-        words = (folder / "cpu.stat").read_text("utf-8").split()
-        return int(words[words.index("usage_usec") + 1]) / 1e6
-    return 0.0
+    return least

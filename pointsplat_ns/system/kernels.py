@@ -1,9 +1,9 @@
 """Functions of the C++ files of this package: built when the package is installed, tried when first used, and called on
 several threads.
 
-Structs and functions are read from the file and the headers beside it that it includes, so that nothing is declared
-twice. Files share what is between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers,
-arrays, pointers and earlier structs.
+Structs and functions are read from the files and their headers, so that nothing is declared twice. Files share what is
+between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers, arrays, pointers and earlier
+structs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from pointsplat_ns.system.native import IS_X86, library_path
+from pointsplat_ns.system.native import IS_X86, cpp_files, library_path
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -128,44 +128,6 @@ SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
 
 
-class _Trial:
-    """Whether this machine can use the kernels: all or none, because results would else be rounded by the one here and
-    by torch there."""
-
-    def __init__(self) -> None:
-        self.members: list[Kernels] = []
-        """Those whose module was imported."""
-        self._tried, self._trying, self._lock = 0, False, threading.RLock()
-        self._why = ""
-
-    def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can. They are loaded if need be, and tried."""
-        if self._why or self._tried == len(self.members):
-            return self._why
-        with self._lock:
-            # What tries them calls them; or another thread has tried them meanwhile.
-            if self._trying or self._why or self._tried == len(self.members):
-                return self._why
-            self._trying = True
-            try:
-                count = len(self.members)
-                self._why = _why_not_loaded() or self._why_not_right(self.members[self._tried : count])
-                self._tried = count
-            finally:
-                self._trying = False
-            if self._why:
-                logger.warning(
-                    "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", self._why
-                )
-        return self._why
-
-    def _why_not_right(self, members: list[Kernels]) -> str:
-        wrong = next((each.source.name for each in members if not each.agrees()), "")
-        return wrong and f"what the compiler made of {wrong} does not do what torch does"
-
-
-_TRIAL = _Trial()
-
 _LIBRARY = library_path()
 
 
@@ -185,36 +147,28 @@ def _why_not_loaded() -> str:
 
 
 class Kernels:
-    """Functions of a C++ file, or of those in a folder, that are faster than torch, for a feature that warnings name by
-    ``what``.
+    """Functions of the C++ files that are faster than torch. All are used or none, because results would else be
+    rounded by the one here and by torch there."""
 
-    What the files declare is what Python calls. ``agree``, which may be given later by :meth:`tried_by`, tells whether
-    the functions do what torch does, on a small input, so that no miscompilation passes; it may call them. All are used
-    together or not at all.
-    """
-
-    def __init__(self, what: str, source: Path, agree: Callable[[], bool] | None = None):
-        self.what, self.source = what, source
-        self.files = sorted(source.glob("*.cpp")) if source.is_dir() else [source]
-        if agree is not None:
-            self.tried_by(agree)
+    def __init__(self) -> None:
+        self.trials: list[Callable[[], bool]] = []
+        """Of the modules that were imported."""
+        self._tried, self._trying, self._why, self._lock = 0, False, "", threading.RLock()
 
     def tried_by(self, agree: Callable[[], bool]) -> Callable[[], bool]:
-        """Set the function that tells whether the kernels do what torch does."""
-        self._agree = agree
-        _TRIAL.members.append(self)
+        """Add a function that tells whether functions do what torch does, on a small input, so that no miscompilation
+        passes; it may call them."""
+        self.trials.append(agree)
         return agree
+
+    @functools.cached_property
+    def _text(self) -> str:
+        return "".join(path.read_text("utf-8") for path in (*cpp_files("*.h"), *cpp_files()))
 
     @functools.cached_property
     def structs(self) -> dict[str, type[Struct]]:
         """The structs that the functions take, by name."""
         return structs_of(self._text)
-
-    @functools.cached_property
-    def _text(self) -> str:
-        """The text of the headers beside the files, and of these."""
-        headers = self.files[0].parent.glob("*.h")
-        return "".join(path.read_text("utf-8") for path in (*sorted(headers), *self.files))
 
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
@@ -229,15 +183,30 @@ class Kernels:
             function.restype, function.argtypes = result, parameters
         return library
 
-    def agrees(self) -> bool:
-        """Whether they do what torch does. Raises OSError as :attr:`library`."""
-        with torch.inference_mode(False):
-            return self._agree()
-
     @property
     def why_missing(self) -> str:
         """The reason why this machine cannot use them; empty if it can. They are loaded if need be, and tried."""
-        return _TRIAL.why_missing()
+        if self._why or self._tried == len(self.trials):
+            return self._why
+        with self._lock:
+            # What tries them calls them; or another thread has tried them meanwhile.
+            if self._trying or self._why or self._tried == len(self.trials):
+                return self._why
+            self._trying = True
+            try:
+                untried, self._why = self.trials[self._tried :], _why_not_loaded()
+                with torch.inference_mode(False):
+                    wrong = None if self._why else next((agree for agree in untried if not agree()), None)
+                if wrong is not None:
+                    self._why = f"the kernels of {wrong.__module__}, as compiled here, do not do what torch does"
+                self._tried += len(untried)
+            finally:
+                self._trying = False
+            if self._why:
+                logger.warning(
+                    "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", self._why
+                )
+        return self._why
 
     def usable(self, wanted: bool | None) -> bool:
         """Whether to use them: not if ``wanted`` is False. True warns where there are none."""
@@ -245,14 +214,16 @@ class Kernels:
             return False
         why = self.why_missing
         if why and wanted:
-            # stacklevel 1: warnings of several kernels with one text are shown once
-            warnings.warn(f"{self.what} stays with torch: {why}", stacklevel=1)
+            warnings.warn(f"torch computes what kernels were asked for: {why}", stacklevel=1)  # one text is shown once
         return not why
 
     def usable_for(self, wanted: bool | None, *tensors: torch.Tensor) -> bool:
         """Whether to use them for these tensors: float32, on a CPU; ``wanted`` as for :meth:`usable`."""
         suited = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors)
         return suited and self.usable(wanted)
+
+
+KERNELS = Kernels()
 
 
 @functools.cache

@@ -4,33 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import subprocess
 import sys
 from pathlib import Path
-
-from pointsplat_ns.errors import PointSplatError
-
-
-def require_room_for_torch() -> None:
-    """Raise PointSplatError where the address space is limited (``ulimit -v``) to less than torch takes.
-
-    To import torch would then end the program without a word that helps, or abort it; it is tried in another process.
-    Without such a limit, nothing is tried.
-    """
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY or limit >= 1 << 34:  # bytes; torch takes a fifth
-        return
-    script = "import sys; sys.path = sys.argv[1:]; import torch"
-    tried = subprocess.run([sys.executable, "-c", script, *sys.path], stdin=subprocess.DEVNULL, capture_output=True)
-    if tried.returncode != 0 and b"No module named 'torch'" not in tried.stderr:
-        raise PointSplatError(
-            f"torch cannot be loaded in {limit / 1e9:.1f} GB of address space (ulimit -v); expected 4 GB or more, or no"
-            " limit"
-        )
 
 
 def keep_freed_memory() -> bool:

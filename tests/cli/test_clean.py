@@ -26,7 +26,7 @@ def test_clean_writes_what_the_function_returns_and_a_picture(room, capsys):
     assert same_bits(written, ps.clean(room, 1.0, resolution="64x48"))
     removed, all_of_them = 3143 - len(written), "3,143"
     assert 5 <= removed < 3143 and f"room_clean.ply: cleaned to {len(written):,} of {all_of_them} Gaussians" in said
-    assert "float before what 40 views show" in said and "cluster" in said and "dB PSNR against the dense scene" in said
+    assert "float before what 40 views show" in said and "cluster" in said and " dB, SSIM " in said
     assert picture.read_bytes()[:4] == b"\x89PNG" and f"{picture}: the scene, what goes, and the result" in said
 
 

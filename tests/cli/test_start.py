@@ -1,6 +1,5 @@
 """The first moments of the program."""
 
-import resource
 import subprocess
 import sys
 
@@ -52,21 +51,6 @@ def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path)
     said = [f"error: a.ply: no such file{expected}"] * len(alone)
     assert done.stderr.splitlines() == said + [f"error: a.ply, b.ply: no such files{expected}"] * len(both)
     assert (done.returncode, done.stdout, [*tmp_path.iterdir()]) == (0, "", [])
-
-
-@pytest.mark.parametrize("gigabytes", [0.5, 1.5, 2.5])
-def test_too_little_address_space_for_torch_is_one_line(gigabytes):
-    """The import of torch ends in a traceback or, with more of it, is aborted."""
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (int(gigabytes * 1e9), int(gigabytes * 1e9)))
-
-    words = [sys.executable, "-c", "from pointsplat_ns.start import program; program()", "info", "room.ply"]
-    done = subprocess.run(words, capture_output=True, text=True, preexec_fn=limit)
-    if "no such file" in done.stderr:
-        pytest.skip("this build of torch takes less")
-    said = f"torch cannot be loaded in {gigabytes} GB of address space (ulimit -v); expected 4 GB or more, or no limit"
-    assert (done.returncode, done.stderr) == (1, f"error: {said}\n")
 
 
 @pytest.mark.parametrize(

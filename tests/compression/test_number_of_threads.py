@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from pointsplat_ns.rasterizer.compiled import blending
+from pointsplat_ns.system.kernels import KERNELS
 
 COMPUTE = """
 import dataclasses, json
@@ -69,7 +69,7 @@ def apart() -> dict[str, dict[str, float]]:
 
 @pytest.mark.parametrize("what", ["image", "gradients", "merged", "refined", "repaired"])
 def test_one_thread_and_two_give_the_same_bits(apart, what):
-    in_order = not blending.KERNELS.why_missing or what not in ("gradients", "repaired")
+    in_order = not KERNELS.why_missing or what not in ("gradients", "repaired")
     # torch adds up gradients in another order on another number of threads; kernels do not
     assert max(apart[f"{what} 2"].values()) <= (0.0 if in_order else 1e-5)
 

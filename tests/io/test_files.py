@@ -1,7 +1,6 @@
 """Files: found, opened and replaced."""
 
 import csv
-import hashlib
 import os
 import shutil
 import stat
@@ -110,14 +109,6 @@ def test_a_file_that_appears_while_a_scene_is_written_stays(tmp_path):
     assert path.read_bytes() == b"of others"
 
 
-def test_of_a_file_it_is_the_hash_of_its_bytes(tmp_path):
-    path = tmp_path / "room.ply"
-    ps.save(normal_scene(5), path)
-    source = source_file(path)
-    data = path.read_bytes()
-    assert (source.name, source.bytes, source.sha256) == ("room.ply", len(data), hashlib.sha256(data).hexdigest())
-
-
 def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
     folder = tmp_path / "room"
     ps.save(normal_scene(5), folder / "meta.json")
@@ -197,15 +188,6 @@ def test_a_text_that_is_a_formula_gets_an_apostrophe(text, tmp_path):
     write_csv([{"name": text, "loss": -1.5, "note": "a=b", "none": None}], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as stream:
         assert [*csv.DictReader(stream)] == [{"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}]
-
-
-def test_the_table_of_a_folder_holds_no_formula_of_a_file_name(tmp_path):
-    name = '=HYPERLINK("http:evil.example")'
-    ps.save(normal_scene(4), tmp_path / "in" / f"{name}.ply")
-    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
-    assert result.name == name
-    with (tmp_path / "out" / "scenes.csv").open(newline="") as stream:
-        assert [row["name"] for row in csv.DictReader(stream)] == [f"'{name}"]
 
 
 def test_links_among_the_tables_of_a_folder_are_not_written_through(tmp_path):

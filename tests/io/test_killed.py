@@ -157,7 +157,7 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new_one(kind, work):
 def test_a_file_beyond_the_size_limit_is_one_error_and_the_old_stays(kind, work):
     place = work / "full" / kind
     said = (place / "said.txt").read_text()
-    assert said.startswith(f"SceneError: {place / 'out'}") and "it needs more than 0.700 kB" in said
+    assert said.startswith(f"SceneError: {place / 'out'}") and "cannot be written (File too large)" in said
     assert shown(place / "out") == shown(place / "before") and not list((place / "out").rglob(".*"))
 
 

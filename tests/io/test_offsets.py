@@ -18,7 +18,6 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.offsets import offset_for
-from pointsplat_ns.io.ply import PlyRows
 
 UTM = (451_234.6, 5_412_345.7, 312.4)
 
@@ -68,14 +67,6 @@ def test_a_geo_referenced_scene_is_drawn_as_at_its_origin(tmp_path):
     got = ps.render(back, original.relative_to(back.offset))
     rounded = ps.render(back.at_offset(None), original)
     assert float(ps.psnr(got, wanted).mean()) > 60 > 25 > float(ps.psnr(rounded, wanted).mean())
-
-
-def test_rows_that_are_read_in_pieces_have_the_offset_of_the_whole(tmp_path):
-    with_doubles(cloud(300), tmp_path / "a.ply")
-    whole, rows = ps.load(tmp_path / "a.ply"), PlyRows.open(tmp_path / "a.ply")
-    assert rows.traits == whole.traits
-    assert same_bits(ps.Gaussians.cat([rows.read(0, 100), rows.read(100, 300)]), whole)
-    assert torch.equal(rows.pick([7, 200]).means, whole.means[[7, 200]])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
@@ -222,10 +213,3 @@ def test_a_ply_that_is_pruned_in_parts_keeps_its_offset(tmp_path):
     whole, small = ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply")
     assert small.offset == whole.offset and len(small) == 2000
     assert np.abs(np.median(absolute(small), axis=0) - np.median(absolute(whole), axis=0)).max() < 0.5
-
-
-def test_commands_print_the_offset_once(tmp_path, capsys):
-    with_doubles(ball(300), tmp_path / "utm.ply")
-    for words in (["prune", "utm.ply", "--keep", "50"], ["convert", "utm.ply", "copy.ply"], ["info", "utm.ply"]):
-        main([words[0], str(tmp_path / words[1]), *(str(tmp_path / w) if w == "copy.ply" else w for w in words[2:])])
-        assert capsys.readouterr().out.count("positions are doubles") == 1, words

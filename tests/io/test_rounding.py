@@ -153,16 +153,6 @@ def test_a_codebook_of_few_numbers_is_exact(values):
     assert torch.allclose(book[index.long()], values, atol=1e-6)
 
 
-def test_a_codebook_is_ascending_and_better_than_even_steps():
-    values = torch.randn(20_000, generator=torch.Generator().manual_seed(1))
-    book, index = codebook(values)
-    assert bool((book.diff() >= 0).all())
-    even = torch.linspace(float(values.min()), float(values.max()), 256)
-    error = (book[index.long()] - values).square().mean()
-    assert error < (values[:, None] - even).abs().amin(dim=1).square().mean()
-    assert float((book[index.long()] - values).abs().max()) <= float(book.diff().max())
-
-
 def test_many_rows_are_stood_for_by_near_ones():
     rows = rows_of(5000, 9)
     shares = []

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -58,34 +57,6 @@ def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_
 
 
 NUMPY_CORE = np.float64.__reduce__(np.float64(1))[0].__module__.split(".")[1]
-
-
-def in_fresh_python(code, *arguments):
-    return subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, *map(str, arguments)], capture_output=True, text=True
-    )
-
-
-def test_stock_loading_fails_before_the_registration_and_works_after_it(tmp_path, checkpoint_of):
-    torch.save(checkpoint_of(normal_scene()), tmp_path / "a.ckpt")
-    code = """
-import sys, torch
-try:
-    torch.load(sys.argv[1], map_location="cpu", weights_only=True)
-    print("loads at once")
-except Exception as error:
-    print("refused", "multiarray.scalar" in str(error))
-from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
-count = len(torch.serialization.get_safe_globals())
-allow_splatfacto_checkpoints()
-once = torch.serialization.get_safe_globals()
-allow_splatfacto_checkpoints()
-print(torch.serialization.get_safe_globals() == once, len(once) - count)
-print(torch.load(sys.argv[1], map_location="cpu", weights_only=True)["schedulers"]["means"]["_last_lr"][0])
-print("nerfstudio" in sys.modules)
-"""
-    done = in_fresh_python(code, tmp_path / "a.ckpt")
-    assert done.stdout.split("\n")[:4] == ["refused True", "True 5", "0.0005", "False"], done.stdout + done.stderr
 
 
 def rewritten(path, change):

@@ -146,7 +146,7 @@ def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written,
         scene = load_replica(written)
     assert not caplog.records
     assert len(scene) == 6 and scene.depths is not None
-    assert scene.params.principal_point() == (32.0, 24.0)
+    assert scene.params.principal_point == (32.0, 24.0)
     assert {p.name for p in written.iterdir()} == {"results", "traj.txt", "cam_params.json"}
     room = room_of(1)
     camera = json.loads((written / "cam_params.json").read_text())["camera"]

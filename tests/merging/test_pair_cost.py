@@ -19,8 +19,9 @@ from pointsplat_ns.merging.covariance import (
     projected_area,
     rms_area,
 )
-from pointsplat_ns.merging.pair_cost import DIRECTIONS, KERNELS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
+from pointsplat_ns.merging.pair_cost import DIRECTIONS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
 from pointsplat_ns.merging.state import Participants, State, initial_state
+from pointsplat_ns.system.kernels import KERNELS
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 

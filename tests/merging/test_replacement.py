@@ -10,10 +10,11 @@ from making import assert_same_on_any_threads, cloud
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.merging import MERGING
 from pointsplat_ns.merging.covariance import covariances, rms_area, unpack
-from pointsplat_ns.merging.matching import KERNELS, cheapest_pairs
+from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.regrouping import Members, Moments, best_groups, group_moments
 from pointsplat_ns.merging.replacement import replace_pairs
 from pointsplat_ns.merging.state import Participants, State, initial_state
+from pointsplat_ns.system.kernels import KERNELS
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 

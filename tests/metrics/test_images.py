@@ -8,7 +8,8 @@ from pytorch_msssim import SSIM
 
 from making import noisy_pair as pair
 from pointsplat_ns.metrics import ImageError, psnr, psnr_of, ssim
-from pointsplat_ns.metrics.structural_similarity import KERNELS, mean_ssim
+from pointsplat_ns.metrics.structural_similarity import mean_ssim
+from pointsplat_ns.system.kernels import KERNELS
 
 
 def test_psnr_of_a_known_error():

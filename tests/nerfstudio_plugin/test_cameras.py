@@ -87,7 +87,7 @@ def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
         assert torch.equal(data["image"], expected["image"])
         assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
         assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
-    assert lazy.frame_cache.num_bytes <= 3e4
+    assert lazy.frame_cache._entries.currsize <= 3e4
     assert lazy.get_train_rays_per_batch() == stock.get_train_rays_per_batch()
     ours, theirs = list(lazy.fixed_indices_eval_dataloader), list(stock.fixed_indices_eval_dataloader)
     assert len(ours) == len(theirs) == len(lazy.fixed_indices_eval_dataloader) > 1

@@ -1,6 +1,5 @@
 """Posed photos loaded when due, and what is kept of them in memory."""
 
-import threading
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
+from pointsplat_ns.nerfstudio_plugin.frames import Frames
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 
 WIDTH, HEIGHT = 40, 30
@@ -102,24 +101,6 @@ def test_reduced_photos_are_of_the_size_of_their_cameras(tmp_path, scale):
         assert (int(camera.width), int(camera.height)) == (image.shape[1], image.shape[0])
 
 
-def test_prefetched_photos_are_decoded_once_by_another_thread(tmp_path):
-    dataset = make_dataset(tmp_path)
-    frames = Frames(dataset)
-    readers = []
-    read = dataset.get_data
-
-    def recorded(index, **kwargs):
-        readers.append((index, threading.current_thread().name))
-        return read(index, **kwargs)
-
-    dataset.get_data = recorded
-    frames.prefetch([1, 2])
-    frames.prefetch([2, 1])
-    assert frames[1][1]["image_idx"] == 1 and frames[2][1]["image_idx"] == 2
-    assert sorted(index for index, _ in readers) == [1, 2]
-    assert all(name.startswith("frames") for _, name in readers)
-
-
 def test_writing_to_what_was_handed_out_does_not_change_the_next(tmp_path):
     frames = Frames(make_dataset(tmp_path))
     camera, data = frames[0]
@@ -131,11 +112,8 @@ def test_writing_to_what_was_handed_out_does_not_change_the_next(tmp_path):
         frames[5]
 
 
-@pytest.mark.parametrize(
-    ("damage", "prefetched"),
-    [("missing", True), ("truncated", False), ("other size", False), ("mask", True)],
-)
-def test_a_bad_photo_is_named(tmp_path, damage, prefetched):
+@pytest.mark.parametrize("damage", ["missing", "truncated", "other size", "mask"])
+def test_a_bad_photo_is_named(tmp_path, damage):
     frames = Frames(make_dataset(tmp_path, masks=True))
     photo = tmp_path / "photo2.png"
     if damage == "truncated":
@@ -145,8 +123,6 @@ def test_a_bad_photo_is_named(tmp_path, damage, prefetched):
             cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH + 2, 3 if path == photo else 1), np.uint8))
     else:
         (tmp_path / "mask2.png" if damage == "mask" else photo).unlink()
-    if prefetched:
-        frames.prefetch([2])
     with pytest.raises(DataError, match="mask2.png" if damage == "mask" else "photo2.png"):
         frames[2]
     assert frames[1][1]["image_idx"] == 1
@@ -202,25 +178,3 @@ def test_a_camera_that_is_not_finite_names_its_photo(tmp_path, name, value):
     setattr(outputs.cameras, name, numbers)
     with pytest.raises(DataError, match="photo1.png: .* frame 1 hold NaN or infinity, as do those of 1 more of 5"):
         UndistortedDataset(outputs)
-
-
-def test_the_bound_holds_while_many_threads_put_and_get():
-    cache = MemoryCache(10)
-    above, wrong = [], []
-
-    def work(seed):
-        for step in range(300):
-            number = (7 * step + seed) % 12
-            cache.put(number, [number, torch.zeros(1 + number % 4, dtype=torch.uint8)])
-            if cache.num_bytes > 10:
-                above.append(cache.num_bytes)
-            found = cache.get(number)
-            if found is not None and found[0] != number:
-                wrong.append(number)
-
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert (above, wrong) == ([], [])

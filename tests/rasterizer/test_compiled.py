@@ -8,10 +8,11 @@ import torch
 
 from making import assert_same_on_any_threads, record_kernels, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.compiled import KERNELS, blending
+from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.ellipses import Region
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
+from pointsplat_ns.system.kernels import KERNELS
 
 F32, F64 = torch.float32, torch.float64
 WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from making import camera_askew, splats_in_view
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.system.kernels import KERNELS
 
 WIDTH, HEIGHT = 37, 29
 F32, F64 = torch.float32, torch.float64

@@ -12,9 +12,10 @@ import warnings
 import pytest
 import torch
 
+from lab.numerics.reference import rasterize_reference
 from making import camera_askew, splats_in_view
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
-from pointsplat_ns.rasterizer import rasterization, rasterize_reference, render, render_depth
+from pointsplat_ns.rasterizer import rasterization, render, render_depth
 from pointsplat_ns.views import View
 
 F64 = torch.float64

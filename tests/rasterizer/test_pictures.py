@@ -9,7 +9,7 @@ import torch
 from making import assert_same_on_any_threads, normal_scene
 from pointsplat_ns.rasterizer import pictures, pixels_of, rasterization, render
 from pointsplat_ns.rasterizer import scene as drawing
-from pointsplat_ns.rasterizer.compiled import KERNELS
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.views import View
 
 WIDTH, HEIGHT = 67, 43

@@ -2,7 +2,7 @@
 
 A change of these files needs a reason:
 
-    python tests/support/golden.py --reason "why the pictures change"
+    PYTHONPATH=. python tests/support/golden.py --reason "why the pictures change"
 
 draws them anew and adds the reason, with the hash of the new file, to ``tests/rasterizer/golden.md``. A test compares
 that hash with the file's, so that neither changes alone.
@@ -134,7 +134,7 @@ def total(renders: Tensor, alphas: Tensor) -> Tensor:
 
 def drawn_by_reference(golden: Golden, scene: dict[str, Tensor]) -> dict[str, Tensor]:
     """Image (H, W, channels), alphas (H, W, 1) and the gradients of :func:`total`, float64."""
-    from pointsplat_ns.rasterizer import rasterize_reference
+    from lab.numerics.reference import rasterize_reference
 
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
     image, alphas, depths = rasterize_reference(

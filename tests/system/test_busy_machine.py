@@ -1,5 +1,6 @@
 """The number of threads beside other programs: on machines that are made up, and on a real one."""
 
+import math
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from pointsplat_ns.system import cores as cores_module
-from pointsplat_ns.system.cores import FreeCores, Group, OtherPrograms
+from pointsplat_ns.system.cores import FreeCores, OtherPrograms
 from pointsplat_ns.system.threads import fixed_threads, in_threads, most_threads, suitable_threads
 from pretend_gpu import GPU
 
@@ -24,24 +25,15 @@ class Machine:
         self.count, self.now, self.own, self.looks = 16, 0.0, 0.0, 0
         self.own_uses = self.others_use = 0.0  # cores
         self.used = 0.0
-        self.quotas: list[tuple[float, float]] = []  # cores of a group, and those that others in it use
-        self.in_groups: list[float] = []
 
     def wait(self, seconds: float) -> None:
         self.now += seconds
         self.own += self.own_uses * seconds
         self.used += (self.own_uses + self.others_use) * seconds
-        self.in_groups = [
-            used + (self.own_uses + others) * seconds
-            for used, (_, others) in zip(self.in_groups or [0.0] * len(self.quotas), self.quotas, strict=True)
-        ]
 
     def limit(self) -> tuple[float, float]:
         self.looks += 1
         return self.count, self.used
-
-    def groups(self, root=None) -> tuple[Group, ...]:
-        return tuple(Group(quota, number) for number, (quota, _) in enumerate(self.quotas))
 
 
 @pytest.fixture
@@ -55,8 +47,7 @@ def machine(monkeypatch):
     monkeypatch.setattr(cores_module, "time", clock)
     monkeypatch.setattr(cores_module, "_machine", made_up.limit)
     monkeypatch.setattr(cores_module, "_allowed", lambda: [*range(made_up.count)])
-    monkeypatch.setattr(cores_module, "limiting_groups", made_up.groups)
-    monkeypatch.setattr(cores_module, "_seconds_of", lambda number: (made_up.in_groups or [0.0] * 9)[number])
+    monkeypatch.setattr(cores_module, "cpu_quota", lambda: math.inf)
     monkeypatch.setattr("pointsplat_ns.system.threads.free_cores", FreeCores())
     before = torch.get_num_threads()
     torch.set_num_threads(made_up.count)
@@ -111,22 +102,13 @@ def test_the_machine_is_looked_at_once_a_second_and_the_number_follows(machine):
 
 
 @pytest.mark.parametrize(
-    ("quota", "in_group", "on_machine", "threads"),
-    [(4.0, 0.0, 40.0, 4), (4.0, 3.0, 40.0, 1), (4.0, 0.0, 62.0, 2), (2.5, 0.0, 0.0, 2), (100.0, 0.0, 10.0, 54)],
+    ("quota", "on_machine", "threads"), [(4.0, 40.0, 4), (4.0, 62.0, 2), (2.5, 0.0, 2), (100.0, 10.0, 54)]
 )
-def test_in_a_container_the_hosts_load_counts_only_where_it_is_full(machine, quota, in_group, on_machine, threads):
-    machine.count, machine.quotas, machine.others_use = 64, [(quota, in_group)], on_machine
+def test_in_a_container_the_hosts_load_counts_only_where_it_is_full(machine, monkeypatch, quota, on_machine, threads):
+    machine.count, machine.others_use = 64, on_machine
+    monkeypatch.setattr(cores_module, "cpu_quota", lambda: quota)
     torch.set_num_threads(64)
     assert used() == threads
-
-
-def test_programs_on_cores_that_this_process_may_not_use_do_not_count(monkeypatch):
-    times = psutil.cpu_times(percpu=True)[0]
-    busy, idle = (times._replace(**{name: 0.0 for name in times._fields}) for _ in range(2))
-    busy, idle = busy._replace(user=7.0, system=2.0, idle=1.0), idle._replace(idle=10.0)
-    monkeypatch.setattr(psutil, "cpu_times", lambda percpu: [busy, idle, busy, idle])
-    monkeypatch.setattr(cores_module, "_allowed", lambda: [1, 2, 9])  # a container may be shown fewer than it has
-    assert cores_module._machine() == (2, 9.0)
 
 
 def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypatch):
@@ -136,12 +118,6 @@ def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypat
     monkeypatch.setattr(psutil, "cpu_times", refused)
     monkeypatch.setattr(cores_module, "_allowed", lambda: [0, 1, 2])
     assert cores_module._machine() == (3, 0.0)
-
-
-def test_time_that_a_control_group_has_used_is_read_in_seconds(tmp_path):
-    assert cores_module._seconds_of(tmp_path) == 0.0
-    (tmp_path / "cpu.stat").write_text("nr_periods 12\nusage_usec 1500000\nuser_usec 1000000\n")
-    assert cores_module._seconds_of(tmp_path) == 1.5
 
 
 def test_the_callers_threads_are_restored_also_after_an_error(machine, caplog):

@@ -94,10 +94,3 @@ def test_tensors_are_passed_by_address_and_kept_alive():
 def test_a_value_that_does_not_fit_a_struct_is_an_error(values, error):
     with pytest.raises(error):
         structs_of(SHARED)["Task"](**values)
-
-
-@pytest.mark.parametrize("wrong", ["int64_t count", "Unknown* task", "float** a"])
-def test_a_declaration_that_is_not_understood_is_an_error(wrong):
-    text = SHARED.replace("int64_t count;", f"{wrong.replace('int64_t', 'size_t')};")
-    with pytest.raises(ValueError, match="not a declaration of numbers, arrays, pointers or structs"):
-        structs_of(text)

@@ -19,7 +19,7 @@ from making import box_room, move_zero_layers
 from pointsplat_ns.compression import repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
-from pointsplat_ns.system.native import cpp_files
+from pointsplat_ns.system.kernels import KERNELS, Kernels
 from pointsplat_ns.system.tensors import FLAGS, FLOATS
 
 PACKAGE = Path(ps.__file__).parent
@@ -176,14 +176,16 @@ def test_the_api_gives_the_same_bits_whatever_torchs_settings(setting, usual):
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_kernels_are_tried_the_same_whatever_torchs_settings(setting):
-    modules = [path for path in PACKAGE.rglob("*.py") if "KERNELS = Kernels(" in path.read_text("utf-8")]
-    names = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in modules]
-    kernels = [importlib.import_module(name.removesuffix(".__init__")).KERNELS for name in names]
-    if any(each.why_missing for each in kernels):
-        pytest.skip(f"no kernels: {kernels[0].why_missing}")
+    for path in PACKAGE.rglob("*.py"):
+        if "@KERNELS.tried_by" in path.read_text("utf-8"):
+            importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
+    if KERNELS.why_missing:
+        pytest.skip(f"no kernels: {KERNELS.why_missing}")
+    assert len(KERNELS.trials) == 6
+    again = Kernels()
+    again.trials = KERNELS.trials
     with SETTINGS[setting]():
-        agree = {path.name: each.agrees() for each in kernels for path in each.files}
-    assert {path.name for path in cpp_files()} == {*agree} and all(agree.values())
+        assert again.why_missing == ""
 
 
 def test_a_network_is_float32_on_the_device_that_was_asked_for():

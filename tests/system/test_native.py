@@ -35,22 +35,25 @@ def test_a_processor_without_avx2_loads_no_library(monkeypatch):
     assert "no AVX2" in kernels._why_not_loaded()
 
 
-def test_kernels_that_disagree_with_torch_are_not_used_and_a_line_says_so(monkeypatch, caplog):
-    monkeypatch.setattr(kernels, "_TRIAL", kernels._Trial())
+@pytest.fixture
+def loadable(monkeypatch) -> kernels.Kernels:
+    """Kernels without trials, of a library that can be loaded."""
     monkeypatch.setattr(kernels, "_why_not_loaded", lambda: "")
-    right, wrong = (
-        kernels.Kernels("drawing", Path(f"{agrees}.cpp"), lambda agrees=agrees: agrees) for agrees in (True, False)
-    )
-    assert not right.usable(None) and not wrong.usable_for(None, torch.zeros(1)) and not right.usable(False)
-    with pytest.warns(UserWarning, match="drawing stays with torch: what the compiler made of False.cpp does not do"):
-        assert not right.usable(True)
+    return kernels.Kernels()
+
+
+def test_kernels_that_disagree_with_torch_are_not_used_and_a_line_says_so(loadable, caplog):
+    loadable.tried_by(lambda: True)
+    assert loadable.usable(None)
+    loadable.tried_by(lambda: False)
+    assert not loadable.usable(None) and not loadable.usable_for(None, torch.zeros(1)) and not loadable.usable(False)
+    with pytest.warns(UserWarning, match="torch computes .*: the kernels of .*test_native, as compiled here, do not"):
+        assert not loadable.usable(True)
     (record,) = caplog.records
-    assert "torch computes all" in record.getMessage() and record.getMessage().endswith(right.why_missing)
+    assert "torch computes all" in record.getMessage() and record.getMessage().endswith(loadable.why_missing)
 
 
-def test_threads_that_wait_for_a_trial_take_its_verdict(monkeypatch):
-    monkeypatch.setattr(kernels, "_TRIAL", kernels._Trial())
-    monkeypatch.setattr(kernels, "_why_not_loaded", lambda: "")
+def test_threads_that_wait_for_a_trial_take_its_verdict(loadable):
     begun, others = threading.Event(), ThreadPoolExecutor(1)
 
     def disagree() -> bool:
@@ -58,9 +61,9 @@ def test_threads_that_wait_for_a_trial_take_its_verdict(monkeypatch):
         time.sleep(0.3)  # the other thread waits meanwhile
         return False
 
-    wrong = kernels.Kernels("drawing", Path("wrong.cpp"), disagree)
-    first = others.submit(wrong.usable, None)
-    assert begun.wait(10) and not wrong.usable(None) and not first.result(10)
+    loadable.tried_by(disagree)
+    first = others.submit(loadable.usable, None)
+    assert begun.wait(10) and not loadable.usable(None) and not first.result(10)
 
 
 DRAW = """
@@ -101,7 +104,8 @@ def test_a_clone_without_kernels_draws_by_torch_and_says_how_to_build_them(tmp_p
     done = python(tmp_path, "-c", DRAW)
     (said,) = done.stderr.splitlines()
     assert said.endswith(f"they were built from other sources; {HOW}")
-    assert done.stdout.splitlines() == ["0.635", f"0.635|the rasterizer stays with torch: {said.partition(': ')[2]}"]
+    why = said.partition(": ")[2]
+    assert done.stdout.splitlines() == ["0.635", f"0.635|torch computes what kernels were asked for: {why}"]
 
 
 def test_a_change_of_any_source_gives_the_library_another_name(monkeypatch):

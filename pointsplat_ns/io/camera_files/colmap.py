@@ -60,20 +60,14 @@ class _Image(NamedTuple):
     camera: int
 
 
-_MOST_POINTS = 5_000_000
-
-_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-_BELOW = ("", "0", "sparse/0", "sparse", "colmap/sparse/0")
-"""Where a model lies below a folder: the model's own, that of all models, or that of a project."""
-
-
 def model_folder(path: Path) -> Path | None:
     """The folder of a COLMAP model: of one of the two files in it, its own, that of all models (``sparse``), or that of
     a project, with ``sparse/0`` or ``colmap/sparse/0`` in it. None if there is no model."""
+    files = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
     if not path.is_dir():
-        return path.parent if path.name in _FILES and path.is_file() else None
-    folders = (path / below for below in _BELOW)
-    return next((folder for folder in folders if any((folder / name).is_file() for name in _FILES)), None)
+        return path.parent if path.name in files and path.is_file() else None
+    folders = (path / below for below in ("", "0", "sparse/0", "sparse", "colmap/sparse/0"))
+    return next((folder for folder in folders if any((folder / name).is_file() for name in files)), None)
 
 
 def colmap_cameras(path: Path) -> CameraFile:
@@ -122,14 +116,14 @@ def colmap_cameras(path: Path) -> CameraFile:
 def colmap_points(path: Path) -> Tensor | None:
     """Positions (N, 3), float64, of the points of a COLMAP model, ``path`` as for :func:`model_folder`; None if there
     are none that can be read, or more than five million."""
-    folder = model_folder(path) or path
+    folder, most = model_folder(path) or path, 5_000_000
     for kind, read in (("bin", _binary_points), ("txt", _text_points)):
         file = folder / f"points3D.{kind}"
         try:
             if file.is_file():
                 with file.open("rb") as stream:
-                    points = torch.tensor([*islice(read(stream, file), _MOST_POINTS + 1)], **DOUBLES).view(-1, 3)
-                usable = 0 < len(points) <= _MOST_POINTS and bool(points.isfinite().all())
+                    points = torch.tensor([*islice(read(stream, file), most + 1)], **DOUBLES).view(-1, 3)
+                usable = 0 < len(points) <= most and bool(points.isfinite().all())
                 return points if usable else None
         except (OSError, DataError, ValueError, IndexError):
             return None

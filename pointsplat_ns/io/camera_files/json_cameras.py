@@ -51,15 +51,11 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     return CameraFile(found, _saved_motion(content, path))
 
 
-EXPORTED = (1920, 1080, 60.0)
-"""Width and height, pixels, and horizontal field of view, degrees, of cameras without intrinsics."""
-
-
 def exported_cameras(content: list[Any], path: Path) -> CameraFile:
-    """The cameras in the JSON of ``ns-export cameras``, which has no intrinsics: :data:`EXPORTED` is taken, with a
-    warning. Raises DataError if an entry is no camera."""
+    """The cameras in the JSON of ``ns-export cameras``, which has no intrinsics: 1920 x 1080 pixels and 60
+    degrees in width are taken, with a warning. Raises DataError if an entry is no camera."""
     need_count(path, len(content))
-    width, height, angle = EXPORTED
+    width, height, angle = 1920, 1080, 60.0
     focal = 0.5 * width / math.tan(0.5 * math.radians(angle))
     found = []
     for index, entry in enumerate(content):

@@ -23,10 +23,6 @@ from pointsplat_ns.geometry.transforms import interleave, spread_bits, zero_as_i
 from pointsplat_ns.io.files import one_line, require_memory
 from pointsplat_ns.system.tensors import INDICES
 
-SATURATED = 0.25
-"""Opacity bytes 0 and 255 are read as 0.25 and 254.75: in the middle of what is written as these bytes, and with a
-logit that is finite. A logit of infinity would be dropped by some programs."""
-
 PACKED = 100
 """Most bytes that a compressed byte is taken to hold. 216,000 Gaussians that differ in nothing but their place on a
 grid have 27; trained scenes less than 4."""
@@ -123,8 +119,9 @@ def joined(parts: Sequence[Gaussians], degree: int | None = None) -> Gaussians:
 
 
 def logits_of_bytes(levels: Array) -> Array:
-    """Opacity logits of bytes, finite; see :data:`SATURATED`."""
-    share = np.clip(levels.astype(np.float64), SATURATED, 255 - SATURATED) / 255
+    """Opacity logits of bytes, finite, as some programs drop infinite ones: bytes 0 and 255 count as 0.25 and 254.75,
+    in the middle of what is written as these."""
+    share = np.clip(levels.astype(np.float64), 0.25, 254.75) / 255
     return np.log(share / (1 - share)).astype(np.float32)
 
 

@@ -34,8 +34,6 @@ _HEADER, _SECTION = 4096, 1024
 _TYPES = {"means": ("<f4", "<u2", "<u2"), "floats": ("<f4", "<f2", "<f2"), "sh": ("<f4", "<f2", "u1")}
 """Types of numbers by compression, 0 to 2."""
 
-MAX_DEGREE = 2
-"""SH degree."""
 _HALF = "float32 or float16"
 
 HOLDS = Holds(
@@ -44,7 +42,7 @@ HOLDS = Holds(
     colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)),
     opacities=Span(0.0, 1.0, 1 / 255),
     rotations=Span(-1.0, 1.0, how=_HALF),
-    sh=Span(how=f"up to degree {MAX_DEGREE}; {_HALF} or 8 bits"),
+    sh=Span(how=f"up to degree 2; {_HALF} or 8 bits"),
     antialiased=False,
 )
 
@@ -104,7 +102,7 @@ def _section(data: bytes, index: int, compression: int, path: Path) -> _Section:
     count, capacity, size, buckets, block, stored, steps, full, partial, degree = struct.unpack_from(
         "<IIIIfH2xI4xIIH", data, _HEADER + index * _SECTION
     )
-    if degree > MAX_DEGREE or count > capacity:
+    if degree > 2 or count > capacity:
         raise SceneError(
             f"{path}: a section of SH degree {degree} with {count} of {capacity} Gaussians; expected degree 0 to 2"
         )

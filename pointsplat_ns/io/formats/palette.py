@@ -15,9 +15,6 @@ LEVELS = 256
 _SAMPLE = 1 << 17
 """Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
 
-_AT_ONCE = 1 << 22
-"""Rows times entries up to which a cluster gets all its entries at once: for fewer, splits take longer and err more."""
-
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means in one dimension):
@@ -98,7 +95,7 @@ def palette(
     while waiting:
         members, k, depth = waiting.pop()
         part, weight = rows[members], weights[members]
-        at_once = k <= branches or k * len(part) <= _AT_ONCE
+        at_once = k <= branches or k * len(part) <= 1 << 22  # for fewer, splits take longer and err more
         if not at_once and depth < deepest:
             sample = torch.randperm(len(part), generator=generator, device="cpu")[:_SAMPLE]
             centres = _means(part[sample], weight[sample], branches, generator)

@@ -48,9 +48,6 @@ from pointsplat_ns.system.tensors import FLOATS
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
 
-LEAST_SIZE = -30.0
-"""Log-scales below are written as this."""
-
 _LEVELS = 65_535  # of positions, steps
 _ACROSS = 64  # palette entries in one row of pixels
 _MOST_ENTRIES = 65_536  # of a palette
@@ -166,14 +163,12 @@ def _rest_of(meta: dict[str, Any]) -> int:
 
 def _read_sh(images: Images, n: int, meta: dict[str, Any]) -> Array:
     part = meta.get("shN")
-    if not part:
+    if not part or part.get("bands") == 0:
         return np.empty((n, 0, 3))
     labels = _pixels(images, n, part, 1)
     index = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
     if "bands" in part:
         rest, entries = _rest_of(meta), int(part["count"])
-        if not rest:
-            return np.empty((n, 0, 3))
         if not 0 < entries <= 65536:
             raise ValueError(f"a palette of {entries} entries, expected 1 to 65536")
         colors = images.pixels(part["files"][0], _ACROSS * rest * -(-entries // _ACROSS), _ACROSS * rest)
@@ -229,7 +224,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
 
     levels, mins, maxs = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
-    scales, scale_index = codebook(scene.scales.clamp_min(LEAST_SIZE))  # as of flat axes
+    scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
     largest, others = smallest_three(unit_quats(scene))
     meta: dict[str, Any] = {
@@ -282,7 +277,7 @@ def _position_steps(scene: Gaussians) -> Tensor:
 
 HOLDS = Holds(
     positions=Span(how=f"{_LEVELS.bit_length()} bits of log(1 + abs(x)), with its sign"),
-    sizes=Span(LEAST_SIZE, how=f"{LEVELS} own numbers"),
+    sizes=Span(-30.0, how=f"{LEVELS} own numbers"),
     colours=Span(how=f"{LEVELS} own numbers"),
     opacities=Span(0.0, 1.0, 1 / 255),
     rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 255),

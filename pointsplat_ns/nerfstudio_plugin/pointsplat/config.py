@@ -36,17 +36,6 @@ network. Merged scenes need little repair, and high rates overfit: after 300 ste
 0.4 dB at 1e-4 and 0.1 dB at 2e-4. At 3e-4 and above (400 steps) it lost, although the two training rooms gained more at
 higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 learns faster."""
 
-RATES = {
-    "fast": REFINER_RATES,
-    "paper": dict.fromkeys(REFINER_RATES, 1e-5),  # section 4, Implementation details
-    "authors": {  # the optimiser of the released code
-        **dict.fromkeys(REFINER_RATES, 3e-5),
-        **dict.fromkeys(("means", "scales", "quats"), 1e-5),
-        "features_rest": 1e-6,
-    },
-}
-"""Learning rates by the names of :attr:`PointSplatTrainerConfig.rates`."""
-
 
 @dataclass
 class PointSplatTrainerConfig(StoppableTrainerConfig):
@@ -56,9 +45,6 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     seconds: float | None = None
     """Train for this time, in place of max_num_iterations: as many steps as fit, with a schedule that ends with it. The
     time before the checkpoint of load_dir is part of it."""
-    rates: Literal["fast", "paper", "authors"] = "fast"
-    """Learning rates of the parts of the network: fast trains a small network in a few hundred steps, paper is 1e-5,
-    authors is the released code's 1e-6 to 3e-5. Rates set by hand, other than the method's own, are not changed."""
     rate_factor: float = 1.0
     """Multiplies all learning rates. 1 suits merged scenes and few rooms. With ten rooms or more, 3 learns faster and
     still generalises; so does 10 on scenes pruned by the paper's score."""
@@ -112,10 +98,7 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
-        registered = RATES.get((self.method_name or "").removeprefix(f"{METHOD_NAMES.refiner}-"), REFINER_RATES)
-        for name, group in config.optimizers.items():
-            if group["optimizer"].lr == registered.get(name):
-                group["optimizer"].lr = RATES[self.rates][name]
+        for group in config.optimizers.values():
             group["optimizer"].lr *= self.rate_factor
             if self.global_norm is not None:
                 group["optimizer"].max_norm = None

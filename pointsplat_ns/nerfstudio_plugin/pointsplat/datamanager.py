@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +20,6 @@ from pointsplat_ns.io.discovery import Supervision, shown_scene
 from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
-from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import Background
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
 
@@ -98,8 +96,6 @@ class ScenesDataManager(SpiralSource):
         if config.sampled_poses < 1 or min(config.sampled_size) < 1:
             size = "{} x {}".format(*config.sampled_size)
             raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
-        self.background = Background()
-        """Prepares scenes before the steps that use them."""
         self._pixels = 0
         self.cache = MemoryCache.of(config.cache_gigabytes)
         held_out_poses = max(1, config.sampled_poses // 5)
@@ -169,26 +165,16 @@ class ScenesDataManager(SpiralSource):
         order = random.Random(f"{self.config.seed} scenes {epoch}").sample(self.train_indices, len(self.train_indices))
         return order[place]
 
-    def _choice(self, step: int) -> tuple[Frames, list[int]]:
-        """Training targets of a step's scene, and which of them it takes: random ones, none of them twice. Their
-        decoding begins."""
-        targets = self.training_frames(self.scene_at(step))
+    def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
+        """Index of a training scene, and some of its training photos with their cameras, on this process's device:
+        random ones, none of them twice."""
+        scene = self.scene_at(step)
+        targets = self.training_frames(scene)
         generator = random.Random(f"{self.config.seed} photos {self.place(step)}")
         chosen = generator.sample(range(len(targets)), min(self.config.images_per_step, len(targets)))
-        targets.prefetch(chosen)
-        return targets, chosen
-
-    def start(self, step: int) -> None:
-        """Prepare the photos of a step in the background, or the poses of its renders, which are drawn when they are
-        needed. An error is raised by :meth:`next_train`."""
-        self.background.start(step, functools.partial(self._choice, step))
-
-    def next_train(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
-        """Index of a training scene, and some of its training photos with their cameras, on this process's device."""
-        targets, chosen = self.background.take(step, functools.partial(self._choice, step))
         frames = [targets[i] for i in chosen]
         self._pixels = sum(int(camera.height) * int(camera.width) for camera, _ in frames)
-        return self.scene_at(step), frames
+        return scene, frames
 
     def next_eval_image(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of an evaluation scene, and one of its held-out photos."""

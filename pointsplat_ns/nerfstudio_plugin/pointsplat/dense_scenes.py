@@ -119,14 +119,13 @@ class DenseScene:
 
     @cached_property
     def rendered_train(self) -> Frames:
-        """Renders of the dense scene from the training poses, in 8 bits as photos are. None are drawn ahead, which
-        would slow the current step."""
-        return Frames(RenderedDataset(self, "train"), "uint8", self.cache, 0, self._device)
+        """Renders of the dense scene from the training poses, in 8 bits as photos are."""
+        return Frames(RenderedDataset(self, "train"), "uint8", self.cache, self._device)
 
     @cached_property
     def rendered_eval(self) -> Frames:
         """Renders of the dense scene from the held-out poses, not rounded."""
-        return Frames(RenderedDataset(self, "test"), "float32", self.cache, 0, self._device)
+        return Frames(RenderedDataset(self, "test"), "float32", self.cache, self._device)
 
     @property
     def train_frames(self) -> Frames:

@@ -18,7 +18,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.metrics.lpips import ReportedLpips
-from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames
+from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table
@@ -68,7 +68,7 @@ def evaluate_scene(
     model: PointSplatModel,
     scene: DenseScene,
     variants: dict[str, Gaussians],
-    frames: Frames | list[Frame],
+    frames: Sequence[Frame],
     lpips: ReportedLpips,
     picture_folder: Path | None = None,
     progress: bool = False,

@@ -7,6 +7,7 @@ viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network i
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -30,9 +31,8 @@ from pointsplat_ns.metrics import ImageError, psnr
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
-from pointsplat_ns.nerfstudio_plugin.pointsplat.preparation import PrunedScene, PrunedScenes
 from pointsplat_ns.pruning import PruneSettings
-from pointsplat_ns.refiner import Refiner, preset
+from pointsplat_ns.refiner import Refiner, Structure, preset
 from pointsplat_ns.refiner.augmentation import random_transform
 
 if TYPE_CHECKING:
@@ -123,6 +123,18 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
             )
 
 
+@dataclass(frozen=True, eq=False)
+class PrunedScene:
+    """A pruned scene and what the network needs beside it."""
+
+    pruned: Gaussians
+    """On the device of the network."""
+    structure: Structure | None
+    """The neighbour tables of the pruned scene; None if it is empty."""
+    seconds: float
+    """Duration of pruning, without reading the scene."""
+
+
 class PointSplatModel(SplatfactoModel):
     """The model described in the module's docstring. The scenes are those of the ``datamanager`` that it is given."""
 
@@ -136,8 +148,9 @@ class PointSplatModel(SplatfactoModel):
         self.refiner.encoder.requires_grad_(self.config.train_encoder)
         self.crop_box: OrientedBox | None = None
         manager: ScenesDataManager = self.kwargs["datamanager"]
-        self.scenes, self.shown = manager.scenes, manager.shown
-        self._pruned = PrunedScenes(manager.cache, self.refiner.prepare, manager.background)
+        self.scenes, self.shown, self._cache = manager.scenes, manager.shown, manager.cache
+        self._latest: tuple[Any, PrunedScene | None] = None, None
+        """The pruned scene of the latest step, which is kept even if the cache has no room for it, after its key."""
         self.no_lpips_reason: str | None = None
         """Why LPIPS is left out of the loss; None while it is part of it."""
         self._refined: tuple[int, Gaussians] | None = None
@@ -165,20 +178,35 @@ class PointSplatModel(SplatfactoModel):
         return {name: parts for name, parts in groups.items() if name != "encoder" or self.config.train_encoder}
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A pruned scene and its neighbour tables, by its index. ``dense`` are its Gaussians, if they have been read
-        already; ``keep`` is by default the config's. Raises PointSplatError if the settings do not fit this scene."""
-        return self._pruned.get(self.scenes[index], self.config.prune_settings(keep), self.device, dense)
-
-    def start(self, index: int, generator: torch.Generator) -> None:
-        """Prune a scene in the background, by its index, for a training step whose random numbers are those of the
-        generator. An error is raised by that step."""
-        self._pruned.start(self.scenes[index], self.config.prune_settings(self._drawn_keep(generator)))
+        """A pruned scene and its neighbour tables, by its index, from memory if it was pruned before. ``dense`` are its
+        Gaussians, if they have been read already; ``keep`` is by default the config's. Raises a PointSplatError that
+        names the scene if the settings do not fit it."""
+        scene, settings = self.scenes[index], self.config.prune_settings(keep)
+        key = "pruned", scene.name, settings
+        found = self._latest[1] if self._latest[0] == key else self._cache.get(key)
+        if found is None:
+            dense = scene.dense(keep=False) if dense is None else dense
+            start = time.perf_counter()
+            try:
+                smaller = settings.prune(dense)
+            except PointSplatError as error:
+                raise type(error)(f"{scene.source}: {error}") from error
+            seconds = time.perf_counter() - start
+            CONSOLE.log(f"{scene.name}: kept {len(smaller):,} of {len(dense):,} Gaussians")
+            smaller = smaller.to(self.device)
+            found = PrunedScene(smaller, self.refiner.prepare(smaller), seconds)
+            self._cache.put(key, found)
+        self._latest = key, found
+        return found
 
     def refine(self, index: int) -> Gaussians:
         """The refined scene; differentiable in training, cached in evaluation."""
         if self.training:
             self._refined = None
-            scene = self.pruned_scene(index, keep=self._drawn_keep())
+            keeps = (self.config.keep, *self.config.more_keeps)
+            # the first random number of a step, if there are several budgets
+            drawn = int(torch.randint(len(keeps), (), device="cpu")) if len(keeps) > 1 else 0
+            scene = self.pruned_scene(index, keep=keeps[drawn])
             if not self.config.augment:
                 return self.refiner(scene.pruned, scene.structure)
             transform = random_transform()
@@ -188,11 +216,6 @@ class PointSplatModel(SplatfactoModel):
             with torch.no_grad():
                 self._refined = index, self.refiner(scene.pruned, scene.structure)
         return self._refined[1]
-
-    def _drawn_keep(self, generator: torch.Generator | None = None) -> float:
-        """The budget of a training step, its first random number if there are several."""
-        keeps = (self.config.keep, *self.config.more_keeps)
-        return keeps[int(torch.randint(len(keeps), (), generator=generator, device="cpu")) if len(keeps) > 1 else 0]
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
         """Render Gaussians with a scene's background and rasterize mode, from a camera of shape (1,), all on the

@@ -39,13 +39,6 @@ MODEL_METADATA = (
 )  # fmt: skip
 """Settings of the model in the metadata of a saved network."""
 
-TRAINER_METADATA = ("method_name", "rates", "rate_factor", "schedule", "drop_at", "global_norm")
-"""Settings of the trainer in the metadata of a saved network."""
-
-LOOK_AHEAD = 4
-"""Number of steps whose scenes are prepared ahead: enough that the background has work while a long step goes on, few
-enough that pruned scenes which wait take little memory."""
-
 
 @dataclass
 class PointSplatPipelineConfig(VanillaPipelineConfig):
@@ -121,32 +114,19 @@ class PointSplatPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
         """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos.
 
-        The step waits only for its own scene. Those of the next steps are read and pruned in the background.
-
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
         been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
         over processes; the gradients are each process's own, and so are the ``own_losses`` among the metrics.
         """
-        for later in range(step, step + 1 + LOOK_AHEAD):
-            self._start(later)
-        torch.manual_seed(self._seed(step))
+        place = self.datamanager.place(step)
+        torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
         outputs, own, metrics = self.model.losses(index, frames)
         means = means_over_ranks({**own, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
         # the values of the means, with the gradients of this process's own
         losses = own if self.world_size == 1 else {n: v + (means[n] - v).detach() for n, v in own.items()}
         return outputs, losses, metrics | {"psnr": means["psnr"], "scene": index, "own_losses": own}
-
-    def _seed(self, step: int) -> int:
-        """Seed of the random numbers of a step."""
-        place = self.datamanager.place(step)
-        return random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63)
-
-    def _start(self, step: int) -> None:
-        """Prepare the scene of a step in the background."""
-        self.datamanager.start(step)
-        self.model.start(self.datamanager.scene_at(step), torch.Generator("cpu").manual_seed(self._seed(step)))
 
     @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
@@ -221,6 +201,7 @@ class PointSplatPipeline(VanillaPipeline):
 
         def save(step: int) -> None:
             trainer = attributes.trainer
+            of_trainer = ("method_name", "rate_factor", "schedule", "drop_at", "global_norm")
             if trainer is not None and processes.rank() == 0:
                 names = [self.datamanager.scenes[i].name for i in self.datamanager.train_indices]
                 save_refiner(
@@ -231,7 +212,7 @@ class PointSplatPipeline(VanillaPipeline):
                         "scenes": ", ".join(names),
                         "supervision": self.datamanager.supervision,
                         **{name: getattr(self.config.model, name) for name in MODEL_METADATA},
-                        **{name: getattr(trainer.config, name) for name in TRAINER_METADATA},
+                        **{name: getattr(trainer.config, name) for name in of_trainer},
                     },
                 )
 

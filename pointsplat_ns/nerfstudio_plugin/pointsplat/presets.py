@@ -11,11 +11,14 @@ for 3D Gaussian Splatting", arXiv 2604.09903), and the code that its authors rel
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import RATES, PointSplatTrainerConfig, pointsplat_config
+from pointsplat_ns.nerfstudio_plugin.pointsplat.config import (
+    REFINER_RATES,
+    PointSplatTrainerConfig,
+    pointsplat_config,
+)
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModelConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipelineConfig
@@ -24,7 +27,8 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeli
 def paper_config() -> PointSplatTrainerConfig:
     """The method ``pointsplat-paper``. Sections, equations and tables are the paper's; "details" is the paragraph
     "Implementation details" of section 4."""
-    config = _preset("paper", _paper_model(), eps=1e-8)  # torch's default: the paper names none
+    rates = dict.fromkeys(REFINER_RATES, 1e-5)  # details
+    config = _preset("paper", _paper_model(), rates, eps=1e-8)  # torch's default: the paper names none
     config.max_num_iterations = 10_000  # details
     config.schedule, config.drop_at = "step", 0.6  # details: "dropped by 10 at iteration 6,000"
     config.global_norm = None  # the paper names no limit of gradients
@@ -63,19 +67,20 @@ def authors_config() -> PointSplatTrainerConfig:
         means_reach=1.0,  # heads: tanh of the residual of means, in unit cubes
         train_encoder=False,  # optimiser: it has the backbone and the heads alone
     )
-    config = _preset("authors", model, eps=1e-15)  # optimiser: Adam's eps
+    rates = dict.fromkeys(REFINER_RATES, 3e-5) | dict.fromkeys(("means", "scales", "quats"), 1e-5)  # optimiser
+    rates["features_rest"] = 1e-6
+    config = _preset("authors", model, rates, eps=1e-15)  # optimiser: Adam's eps
     config.max_num_iterations = 10_000  # the paper's
     config.schedule, config.drop_at = "step", 0.7  # schedule named "cosine": MultiStep, a tenth at 7,000
     config.global_norm = 2.0  # training: one norm of all gradients
     return config
 
 
-def _preset(name: Literal["paper", "authors"], model: PointSplatModelConfig, eps: float) -> PointSplatTrainerConfig:
+def _preset(name: str, model: PointSplatModelConfig, rates: dict[str, float], eps: float) -> PointSplatTrainerConfig:
     config = pointsplat_config()
     config.method_name = f"{METHOD_NAMES.refiner}-{name}"
-    config.rates = name  # details: 1e-5; optimiser: 3e-5, means, scales and quats 1e-5, features_rest 1e-6
     config.optimizers = {
-        part: {"optimizer": FusedAdamConfig(lr=rate, eps=eps), "scheduler": None} for part, rate in RATES[name].items()
+        part: {"optimizer": FusedAdamConfig(lr=rate, eps=eps), "scheduler": None} for part, rate in rates.items()
     }
     scenes = ScenesDataManagerConfig(
         supervision="photos",  # section 4, Datasets: images of the scenes

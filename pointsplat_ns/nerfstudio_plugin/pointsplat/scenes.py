@@ -39,7 +39,8 @@ def dataparser_of(run: Run) -> DataParser:
     """The dataparser that a run was trained with, with the same settings.
 
     Only classes that nerfstudio or an installed plugin registers are used: the name in the run's file is looked up
-    among them and is never imported. Raises SceneError if the dataparser is not installed or does not know a setting.
+    among them and is never imported. A setting that it does not know is left out, with a line in the log. Raises
+    SceneError if the dataparser is not installed.
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
@@ -52,17 +53,13 @@ def dataparser_of(run: Run) -> DataParser:
         )
     config = classes[name]()
     fields = {f.name for f in dataclasses.fields(config)}
+    unknown = [name for name, value in run.dataparser_fields.items() if name not in fields and value is not None]
+    if unknown:
+        CONSOLE.log(f"{run.config_path}: settings that its dataparser no longer has are left out: {', '.join(unknown)}")
     for field_name, value in run.dataparser_fields.items():
-        if field_name not in fields:
-            if value is None:
-                continue  # an option that was not given, and is gone
-            raise SceneError(
-                f"{run.config_path}: its dataparser has no setting {field_name!r}; install the version it had"
-            )
-        if isinstance(value, Tagged):
-            continue  # a Python object: keep the default
-        # Seed points are not needed.
-        setattr(config, field_name, False if field_name in ("load_seed_points", "load_3D_points") else value)
+        if field_name in fields and not isinstance(value, Tagged):  # of a Python object, the default is kept
+            # Seed points are not needed.
+            setattr(config, field_name, False if field_name in ("load_seed_points", "load_3D_points") else value)
     config.data = run.data
     return config.setup()
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -29,22 +28,13 @@ class ReplicaDataParserConfig(DataParserConfig):
     """Scene folder, with traj.txt and results/ (cam_params.json in it or in the folder above), or a sequence with
     traj_w_c.txt and rgb/."""
     frame_stride: int = 1
-    """Use every n-th frame, in the order of their numbers. Frames of eval_frames are always used."""
+    """Use every n-th frame, in the order of their numbers."""
     eval_every: int = 10
     """Hold out every n-th of the used frames for evaluation, the first one included."""
-    eval_frames: tuple[int, ...] = ()
-    """Hold out these frames instead, by the number in the file name."""
-    scale_factor: float = 1.0
-    """Multiplies the camera positions and the seed points."""
     load_seed_points: bool = True
     """Fuse the depth images of the training frames into points from which Splatfacto starts."""
     num_seed_points: int = 50_000
     """Number of seed points at most."""
-    depth_unit_scale_factor: float | None = None
-    """Scene units per count of the depth images. Default: 1 / scale of cam_params.json."""
-    pixel_centers: Literal["auto", "integer", "half"] = "auto"
-    """Origin of cx and cy. integer: the centre of the first pixel (Replica's own 599.5 of 1200). half: the corner of
-    the image. auto: half if cx and cy are exactly half the image size, integer otherwise."""
 
 
 @dataclass
@@ -60,15 +50,12 @@ class ReplicaDataParser(DataParser):
         config = self.config
         self._check_config()
         self._scene = scene = self._scene or load_replica(config.data)  # once for both splits
-        if config.depth_unit_scale_factor is not None:
-            scene = replace(scene, params=replace(scene.params, scale=1.0 / config.depth_unit_scale_factor))
         train, held_out = self._split(scene)
         part = scene.select(train if split == "train" else held_out)
         params = scene.params
-        cx, cy = params.principal_point(config.pixel_centers)
+        cx, cy = params.principal_point
 
         camera_to_worlds = flip_camera_axes(torch.from_numpy(part.poses))[:, :3]  # OpenCV to nerfstudio's OpenGL
-        camera_to_worlds[:, :, 3] *= config.scale_factor
         cameras = Cameras(
             camera_to_worlds.float(), params.fx, params.fy, cx, cy, params.width, params.height,
             camera_type=CameraType.PERSPECTIVE,
@@ -78,89 +65,63 @@ class ReplicaDataParser(DataParser):
             metadata["depth_filenames"] = list(part.depths)
             metadata["depth_unit_scale_factor"] = 1.0 / params.scale
         if split == "train" and config.load_seed_points:
-            metadata.update(self._seed_points(part, (cx, cy)))
+            metadata.update(self._seed_points(part))
         return DataparserOutputs(
             image_filenames=list(part.photos),
             cameras=cameras,
-            scene_box=_scene_box(scene, config.scale_factor),
-            dataparser_scale=config.scale_factor,
+            scene_box=_scene_box(scene),
             metadata=metadata,
         )
 
     def _check_config(self) -> None:
-        least = {
-            "frame_stride": 1,
-            "eval_every": 2,
-            "num_seed_points": 1,
-            "scale_factor": 0,
-            "depth_unit_scale_factor": 0,
-        }
-        for name, bound in least.items():
-            value = getattr(self.config, name)
-            if value is not None and not (bound <= value < np.inf and value > 0):  # NaN fails too
-                wanted = f"a number of at least {bound}" if bound else "a positive number"
-                raise DataError(f"--{name.replace('_', '-')} {value}: expected {wanted}")
+        for name, least in {"frame_stride": 1, "eval_every": 2, "num_seed_points": 1}.items():
+            if (value := getattr(self.config, name)) < least:
+                raise DataError(f"--{name.replace('_', '-')} {value}: expected a number of at least {least}")
 
     def _split(self, scene: ReplicaScene) -> tuple[list[int], list[int]]:
         """Positions of the training and of the held-out frames in ``scene``."""
         config = self.config
         used = list(range(0, len(scene), config.frame_stride))
-        if config.eval_frames:
-            position = {number: i for i, number in enumerate(scene.numbers)}
-            unknown = [n for n in config.eval_frames if n not in position]
-            if unknown:
-                raise DataError(
-                    f"--eval-frames: frame {unknown[0]} is not among the {len(scene)} usable frames of {scene.folder} "
-                    f"(numbers {scene.numbers[0]} to {scene.numbers[-1]})"
-                )
-            held_out = sorted({position[n] for n in config.eval_frames})
-        else:
-            held_out = used[:: config.eval_every]
+        held_out = used[:: config.eval_every]
         train = sorted(set(used) - set(held_out))
         if not train or not held_out:
             raise DataError(
                 f"{scene.folder}: {len(scene)} usable frames leave {len(train)} for training and {len(held_out)} "
-                "held out; expected at least one of each: change --frame-stride, --eval-every or --eval-frames"
+                "held out; expected at least one of each: change --frame-stride or --eval-every"
             )
         return train, held_out
 
-    def _seed_points(self, train: ReplicaScene, principal_point: tuple[float, float]) -> dict[str, torch.Tensor]:
+    def _seed_points(self, train: ReplicaScene) -> dict[str, torch.Tensor]:
         if train.depths is None:
             CONSOLE.log(f"{train.folder}: no depth images, so no seed points, and a training starts from random ones")
             return {}
-        xyz, rgb = fuse_depth(train, self.config.num_seed_points, principal_point)
+        xyz, rgb = fuse_depth(train, self.config.num_seed_points)
         if len(xyz) == 0:
             CONSOLE.log(f"{train.folder}: no pixel of the depth images is known, so no seed points")
             return {}
-        return {
-            "points3D_xyz": torch.from_numpy(xyz * np.float32(self.config.scale_factor)),
-            "points3D_rgb": torch.from_numpy(rgb),
-        }
+        return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb)}
 
 
-def _scene_box(scene: ReplicaScene, scale: float) -> SceneBox:
+def _scene_box(scene: ReplicaScene) -> SceneBox:
     """The box of all camera positions, widened on every side by its diagonal (at least one unit)."""
     centers = scene.poses[:, :3, 3]
     low, high = centers.min(axis=0), centers.max(axis=0)
     margin = max(float(np.linalg.norm(high - low)), 1.0)
-    aabb = np.stack([low - margin, high + margin]) * scale
+    aabb = np.stack([low - margin, high + margin])
     return SceneBox(aabb=torch.from_numpy(aabb.astype(np.float32)))
 
 
-def fuse_depth(
-    scene: ReplicaScene,
-    num_points: int,
-    principal_point: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray]:
+def fuse_depth(scene: ReplicaScene, num_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Unproject the depth images of a scene that has them and thin them to at most ``num_points`` points: xyz float32
     (P, 3) in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
 
     At most 200 frames are read, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. At
     most ``40 * num_points`` pixels are kept in total, several for most voxels, so that time and memory do not grow with
     the length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxels are as small as
-    ``num_points`` allows. ``principal_point`` is (cx, cy) with the first pixel's centre at 0.5.
+    ``num_points`` allows.
     """
     depths, params = scene.depths or (), scene.params
+    cx, cy = params.principal_point
     chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 200)).round().astype(int))
     budget = max(num_points * 40 // len(chosen), 1)
     step = max(int(np.ceil(np.sqrt(params.width * params.height / budget))), 1)
@@ -175,7 +136,6 @@ def fuse_depth(
         v, u = np.mgrid[offset // step : params.height : step, offset % step : params.width : step]
         v, u = v[valid[v, u]], u[valid[v, u]]
         z = depth[v, u].astype(np.float64)
-        cx, cy = principal_point
         camera = np.stack([(u + 0.5 - cx) / params.fx * z, (v + 0.5 - cy) / params.fy * z, z], axis=-1)
         pose = scene.poses[index]
         all_xyz.append((camera @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))

@@ -18,7 +18,7 @@ import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -78,17 +78,14 @@ class PinholeParams:
     scale: float
     path: Path
 
-    def principal_point(self, centers: Literal["auto", "integer", "half"] = "auto") -> tuple[float, float]:
+    @property
+    def principal_point(self) -> tuple[float, float]:
         """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
 
-        There are two conventions. ``integer``: the centre of the first pixel is 0, so the middle of an image 1200 wide
-        is 599.5, as in Replica's own file and in OpenCV; half a pixel is added. ``half``: coordinates start at the
-        corner of the image, whose middle is then w / 2; nothing is added. ``auto`` chooses ``half`` if the principal
-        point is exactly (w / 2, h / 2), and ``integer`` otherwise.
+        If it is exactly (w / 2, h / 2) in the file, coordinates start at the corner of the image. Otherwise the centre
+        of the first pixel is 0, as in Replica's own file (599.5 of 1200) and in OpenCV, and half a pixel is added.
         """
-        if centers == "auto":
-            centers = "half" if (self.cx, self.cy) == (self.width / 2, self.height / 2) else "integer"
-        shift = 0.5 if centers == "integer" else 0.0
+        shift = 0.0 if (self.cx, self.cy) == (self.width / 2, self.height / 2) else 0.5
         return self.cx + shift, self.cy + shift
 
 

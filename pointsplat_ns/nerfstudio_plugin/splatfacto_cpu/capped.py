@@ -40,10 +40,6 @@ class CappedStrategy(Strategy):
     """There is no densification from this step on."""
     every: int
     """Number of steps from one densification to the next."""
-    noise: float
-    """Factor on the noise, times the learning rate of the means."""
-    least_opacity: float = 0.005
-    """Gaussians of at most this opacity move, as in the paper."""
     absgrad: bool = False
     """Whether the rasterizer has to keep the absolute gradients of projected centres."""
 
@@ -68,14 +64,14 @@ class CappedStrategy(Strategy):
             if step % self.every == 0 and self.first_step < step < self.last_step:
                 self._densify(params, optimizers, step)
             noise = position_noise(params["scales"], params["quats"], params["opacities"])
-            params["means"].add_(noise, alpha=self.noise * optimizers["means"].param_groups[0]["lr"])
+            params["means"].add_(noise, alpha=5e5 * optimizers["means"].param_groups[0]["lr"])
 
     def _densify(
         self, params: MutableMapping[str, torch.nn.Parameter], optimizers: Mapping[str, Optimizer], step: int
     ) -> None:
         num = len(params["means"])
         opacities = torch.sigmoid(params["opacities"][:, 0])
-        dead = opacities <= self.least_opacity
+        dead = opacities <= 0.005
         if dead.all():
             return
         count = next_count(num, self.most, (self.full_from - 1 - step) // self.every)
@@ -122,24 +118,20 @@ def shared_opacity(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[T
     return (opacity.log() - passed).to(opacities.dtype), (scales.double() + factor[:, None]).to(scales.dtype)
 
 
-def position_noise(
-    scales: Tensor, quats: Tensor, opacities: Tensor, slope: float = 100.0, least: float = 0.005
-) -> Tensor:
+def position_noise(scales: Tensor, quats: Tensor, opacities: Tensor) -> Tensor:
     """Random moves of N Gaussians, as long as they are wide, and the shorter the more opaque they are: covariance times
-    normal numbers times the logistic function of k (t - o) (the paper's equation 8).
+    normal numbers times the logistic function of 100 (0.005 - o) (the paper's equation 8).
 
     Args:
         scales: (N, 3) natural logarithms.
         quats: (N, 4) wxyz.
         opacities: (N, 1) logits.
-        slope: k.
-        least: t, an opacity: there the share is a half; with these values it is next to none from 0.05 on.
 
     Returns:
         (N, 3), scene units.
     """
     normal = torch.randn(scales.shape[0], 3, 1, dtype=scales.dtype, device=scales.device)
-    share = torch.sigmoid(slope * (least - torch.sigmoid(opacities)))
+    share = torch.sigmoid(100.0 * (0.005 - torch.sigmoid(opacities)))  # next to none from 0.05 on
     turn = rotation_matrices(quats)
     return share * (turn @ ((2 * scales).exp()[:, :, None] * (turn.mT @ normal)))[..., 0]
 
@@ -154,12 +146,12 @@ def drawn(weights: Tensor, count: int) -> Tensor:
     return chosen.clamp(max=int(weights.nonzero()[-1]))  # where the product is rounded up to the last end
 
 
-def next_count(num: int, most: int, later: int, least_factor: float = 1.05) -> int:
+def next_count(num: int, most: int, later: int) -> int:
     """Number of Gaussians after a densification of ``num``, if ``later`` more follow until ``most`` has to be reached:
     the same factor for each, and at least the paper's."""
     if num >= most or later <= 0:
         return most
-    return min(most, math.ceil(num * max(least_factor, (most / num) ** (1 / (later + 1)))))
+    return min(most, math.ceil(num * max(1.05, (most / num) ** (1 / (later + 1)))))
 
 
 def replaced(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -67,40 +67,23 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
     """Splatfacto's config, the options of the rasterizer, and those of densification with a cap"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
-    strategy: Literal["default", "mcmc"] = "default"
-    """Densification: Splatfacto's, or 3DGS-MCMC, which trains a given number of Gaussians. If max_gs_num is set, it is
-    always mcmc."""
     max_gs_num: int | None = None
-    """Number of Gaussians of the trained scene, with mcmc; by default 1,000,000."""
+    """Number of Gaussians of the trained scene, which 3DGS-MCMC then reaches at stop_split_at; by default Splatfacto's
+    densification decides."""
     stop_relocation_at: int = 25_000
-    """Step at which mcmc stops to move Gaussians to others. Their number is reached at stop_split_at."""
-    noise_lr: float = 5e5
-    """Factor on the noise of mcmc, which is also in proportion to the learning rate of the means."""
-    mcmc_opacity_reg: float = 0.01
-    """Weight of the mean opacity in the loss of mcmc."""
-    mcmc_scale_reg: float = 0.01
-    """Weight of the mean size in the loss of mcmc."""
-
-    @property
-    def cap(self) -> int | None:
-        """Number of Gaussians to train; None if there is no cap. Raises PointSplatError if it is below 1."""
-        if self.strategy == "default" and self.max_gs_num is None:
-            return None
-        most = 1_000_000 if self.max_gs_num is None else self.max_gs_num
-        if most < 1:
-            raise PointSplatError(f"--pipeline.model.max-gs-num {most}: expected at least 1")
-        return most
+    """Step at which 3DGS-MCMC stops to move Gaussians to others."""
 
     def densification(self, num_photos: int) -> Strategy:
-        """The strategy of a training on that many photos."""
-        if (most := self.cap) is not None:
+        """The strategy of a training on that many photos. Raises PointSplatError if ``max_gs_num`` is below 1."""
+        if self.max_gs_num is not None:
+            if self.max_gs_num < 1:
+                raise PointSplatError(f"--pipeline.model.max-gs-num {self.max_gs_num}: expected at least 1")
             return CappedStrategy(
-                most=most,
+                most=self.max_gs_num,
                 first_step=self.warmup_length,
                 full_from=self.stop_split_at,
                 last_step=self.stop_relocation_at,
                 every=self.refine_every,
-                noise=self.noise_lr,
             )
         return DefaultStrategy(
             prune_opa=self.cull_alpha_thresh,
@@ -136,9 +119,11 @@ class SplatfactoCpuModel(SplatfactoModel):
         Splatfacto's own method is not called: it puts seed points on CUDA and downloads LPIPS.
         """
         config = self.config
+        self.strategy = config.densification(self.num_train_data)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         self.seed_points = None if config.random_init else finite_seeds(self.seed_points)
-        drawn = random_seeds if config.cap is None else random_seeds_near_cameras
-        seeds = at_most(config.cap, *(self.seed_points or drawn(config)))
+        drawn = random_seeds if config.max_gs_num is None else random_seeds_near_cameras
+        seeds = at_most(config.max_gs_num, *(self.seed_points or drawn(config)))
         self.gauss_params = self._seed_parameters(*seeds)
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
@@ -155,8 +140,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             if config.background_color == "random"
             else get_color(config.background_color)
         )
-        self.strategy = config.densification(self.num_train_data)
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def ssim(self, image: Tensor, other: Tensor) -> Tensor:
         """Mean SSIM of two (1, 3, H, W) images in [0, 1], as Splatfacto's."""
@@ -186,7 +169,7 @@ class SplatfactoCpuModel(SplatfactoModel):
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # as nerfstudio's
         """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints. Raises PointSplatError if it
         has more Gaussians than the cap."""
-        num, most = len(dict["gauss_params.means" if "gauss_params.means" in dict else "means"]), self.config.cap
+        num, most = len(dict["gauss_params.means" if "gauss_params.means" in dict else "means"]), self.config.max_gs_num
         if most is not None and num > most:
             raise PointSplatError(
                 f"the checkpoint has {num:,} Gaussians; expected at most {most:,}, as --pipeline.model.max-gs-num "
@@ -313,9 +296,9 @@ class SplatfactoCpuModel(SplatfactoModel):
         """As Splatfacto's, and in trainings with a cap the paper's weights on opacity and size, which free Gaussians
         that are not needed where they are."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if self.training and self.config.cap is not None:
-            losses["opacity_reg"] = self.config.mcmc_opacity_reg * _sigmoid(self.opacities).mean()
-            losses["size_reg"] = self.config.mcmc_scale_reg * torch.exp(self.scales).mean()
+        if self.training and self.config.max_gs_num is not None:
+            losses["opacity_reg"] = 0.01 * _sigmoid(self.opacities).mean()
+            losses["size_reg"] = 0.01 * torch.exp(self.scales).mean()
         return losses
 
     def get_image_metrics_and_images(

@@ -16,7 +16,6 @@ constexpr int AHEAD = 16;    // pairs that are fetched early
 constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
 constexpr float HALF = 0.5f * (TILE - 1);
-constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
 constexpr float ROUNDING = 1e-3f;  // log2 alpha: no pixel that is drawn is left out
 
 typedef Lane Row;  // of pixels
@@ -32,20 +31,6 @@ inline Row load(const float* from) {
 }
 
 inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
-
-// All bits of a vector's numbers.
-inline uint32_t bits_of(Mask mask) {
-    uint64_t parts[4];
-    std::memcpy(parts, &mask, sizeof(mask));
-    const uint64_t both = (parts[0] | parts[1]) | (parts[2] | parts[3]);
-    return static_cast<uint32_t>(both | both >> 32);
-}
-
-// Calls ``work`` with the place of each bit that is set, the lowest first.
-template <typename Work>
-inline void each_bit(uint32_t bits, Work work) {
-    for (; bits; bits &= bits - 1) work(__builtin_ctz(bits));
-}
 
 }  // namespace
 

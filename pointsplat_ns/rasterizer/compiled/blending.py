@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer.alpha import CLAMPED
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.ellipses import Region
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
-from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.rasterizer.compiled import KERNELS
-from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 
 
 class CompiledColor(torch.autograd.Function):

@@ -36,7 +36,6 @@ struct Placing {
 
 namespace {
 
-constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
 constexpr int GEOMETRY = 6;    // columns of the table before the colours
 constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
 

@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, COMPENSATION_MIN
 from pointsplat_ns.rasterizer.ewa import Lens, longest_axis
-from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
 
 

@@ -6,10 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.compiled import KERNELS
 from pointsplat_ns.rasterizer.constants import SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region, TileList
-from pointsplat_ns.system.kernels import SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import INDICES
 
 

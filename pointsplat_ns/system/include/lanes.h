@@ -14,6 +14,7 @@ namespace {
 constexpr int LANES = 8;
 constexpr int TILE = 8;          // edge of a tile, pixels
 constexpr int64_t RANGE = 1024;  // Gaussians that a thread takes at once
+constexpr float LN2 = 0.693147180559945f, LOG2E = 1.44269504088896f;
 constexpr float SHORTEST = std::numeric_limits<float>::min();  // vectors of no larger component are zero
 
 typedef float Lane __attribute__((vector_size(4 * LANES)));
@@ -31,6 +32,20 @@ inline Lane clamp(Lane x, float low, float high) { return smaller(larger(x, ZERO
 inline Lane magnitude(Lane x) { return larger(x, -x); }
 
 inline Mask is_finite(Lane x) { return x - x == ZERO; }
+
+// All bits of a vector's numbers.
+inline uint32_t bits_of(Mask mask) {
+    uint64_t parts[4];
+    std::memcpy(parts, &mask, sizeof(mask));
+    const uint64_t both = (parts[0] | parts[1]) | (parts[2] | parts[3]);
+    return static_cast<uint32_t>(both | both >> 32);
+}
+
+// Calls ``work`` with the place of each bit that is set, the lowest first.
+template <typename Work>
+inline void each_bit(uint32_t bits, Work work) {
+    for (; bits; bits &= bits - 1) work(__builtin_ctz(bits));
+}
 
 inline Lane narrow(Wide x) { return __builtin_convertvector(x, Lane); }
 

@@ -8,17 +8,14 @@ import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
-from torch import nn
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
-from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
 from pointsplat_ns.refiner import Refiner, preset
-from pointsplat_ns.refiner.network import BatchNorm, SubmanifoldConv
 from pointsplat_ns.refiner.weights import read_metadata
 
 PRESETS = {"paper": paper_config, "authors": authors_config}
@@ -29,7 +26,6 @@ FIELDS = {
     "max_num_iterations": (10_000, 10_000),
     "schedule": ("step", "step"),
     "drop_at": (0.6, 0.7),
-    "rates": ("paper", "authors"),
     "rate_factor": (1.0, 1.0),
     "global_norm": (None, 2.0),
     "seconds": (None, None),
@@ -78,18 +74,6 @@ def test_each_field_of_a_preset_is_that_of_its_source(name, column):
     assert {(o.eps, o.max_norm, o.weight_decay) for o in optimizers.values()} == {((1e-8, 1e-15)[column], None, 0)}
 
 
-@pytest.mark.parametrize(("name", "depths"), [("paper", [2, 2, 2, 4, 2]), ("authors", [2, 2, 2, 6, 2])])
-def test_the_network_of_a_preset_is_that_of_its_source(name, depths):
-    model = PRESETS[name]().pipeline.model
-    network = Refiner(preset(model.size, **model.network_options()), device="meta")
-    assert [len(stage.blocks) for stage in network.backbone.encoder] == depths
-    assert [len(stage.blocks) for stage in network.backbone.decoder] == [2, 2, 2, 2]
-    assert type(network.backbone.embed) is (SubmanifoldConv if name == "paper" else nn.Linear)
-    assert [type(layer) for layer in network.backbone.embed_out] == [BatchNorm, nn.GELU]
-    assert [type(layer) for layer in network.encoder.geometry] == [nn.Linear, BatchNorm, nn.ReLU, nn.Linear]
-    assert network.encoder.gate_gain == 1 and network.heads.means_reach == 1.0
-
-
 def small(name, data, output_dir):
     """A preset at a size for tests."""
     config = PRESETS[name]()
@@ -133,9 +117,8 @@ def test_a_preset_trains_and_its_run_and_weights_open_again(trained_walls, run_t
     for opened in (load_refiner(config.get_base_dir()).network, load_refiner(weights).network, again.model.refiner):
         assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
     about = read_metadata(weights)
-    assert {key: about[key] for key in ("method_name", "rates", "drop_at", "global_norm", "train_encoder")} == {
+    assert {key: about[key] for key in ("method_name", "drop_at", "global_norm", "train_encoder")} == {
         "method_name": config.method_name,
-        "rates": name,
         "drop_at": config.drop_at,
         "global_norm": config.global_norm,
         "train_encoder": name == "paper",
@@ -174,15 +157,6 @@ def test_settings_out_of_range_are_refused(changes, said):
         setattr(config, name, value)
     with pytest.raises(PointSplatError, match=said):
         config.setup(local_rank=0, world_size=1)
-
-
-def test_other_rates_replace_those_of_a_preset_but_not_what_is_set_by_hand():
-    config = paper_config()
-    config.rates = "fast"
-    config.optimizers["means"]["optimizer"].lr = 2e-4
-    trainer = config.setup(local_rank=0, world_size=1)
-    rates = {part: group["optimizer"].lr for part, group in trainer.config.optimizers.items()}
-    assert rates == {**REFINER_RATES, "means": 2e-4}
 
 
 def test_a_run_that_was_made_before_these_options_opens(trained, tmp_path):

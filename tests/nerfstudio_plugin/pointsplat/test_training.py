@@ -1,6 +1,7 @@
 """Training, also with steps that are skipped."""
 
 import copy
+import shutil
 from unittest import mock
 
 import pytest
@@ -10,8 +11,10 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch loa
 from broken_steps import broken
 from making import dense_config, equal
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
 from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import MODEL_METADATA
 from pointsplat_ns.refiner import read_refiner
 from pointsplat_ns.refiner.weights import read_metadata
@@ -43,7 +46,7 @@ def test_the_network_is_saved_by_itself_at_the_end(trained):
     model = {name: getattr(config.pipeline.model, name) for name in MODEL_METADATA}
     assert {name: about[name] for name in model} == {**model, "more_keeps": list(model["more_keeps"])}
     assert (about["steps"], about["scenes"], about["keep"], about["by"]) == (10, "wall-a", 0.5, "paper")
-    assert (about["supervision"], about["rates"], about["rate_factor"]) == ("photos", "fast", config.rate_factor)
+    assert (about["supervision"], about["rate_factor"]) == ("photos", config.rate_factor)
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
 
@@ -99,3 +102,32 @@ def test_after_too_many_skipped_steps_training_stops_and_names_the_scenes(three_
         run_training(config)
     assert "\n" not in str(caught.value)
     assert (config.get_checkpoint_dir() / "step-000000003.ckpt").is_file(), "what was done so far is kept"
+
+
+def test_losses_do_not_depend_on_what_stays_in_memory(three_rooms, run_training, tmp_path):
+    results = []
+    for gigabytes in (None, 0.0):
+        config = dense_config(three_rooms, tmp_path / str(gigabytes), 7)
+        config.pipeline.model.more_keeps = (0.3,)
+        config.pipeline.datamanager.cache_gigabytes = gigabytes
+        trainer, losses = run_training(config)
+        results.append((losses, trainer.pipeline.model.refiner.state_dict()))
+    assert results[0][0] == results[1][0] and equal(results[0][1], results[1][1])
+
+
+def test_a_scene_that_cannot_be_used_ends_the_training_at_its_turn(three_rooms, run_training, tmp_path):
+    shutil.copytree(three_rooms, tmp_path / "rooms")
+    config = dense_config(tmp_path / "rooms", tmp_path / "outputs", 3)
+    order = [config.pipeline.setup(device="cpu").datamanager.scene_at(step) for step in range(3)]
+    path = tmp_path / "rooms" / f"room{order[-1]}.ply"
+    scene = read_ply(path)
+    scene.means.fill_(float("nan"))
+    path.unlink()
+    write_ply(scene, path)
+    steps, losses = [], PointSplatModel.losses
+    with (
+        mock.patch.object(PointSplatModel, "losses", lambda *given: steps.append(given) or losses(*given)),
+        pytest.raises(DataError, match=f"^{path}: "),
+    ):
+        run_training(config)
+    assert 2 <= len(steps) <= 3

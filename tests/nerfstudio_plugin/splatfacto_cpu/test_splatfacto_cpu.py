@@ -136,15 +136,6 @@ def test_black_seeds_start_from_random_colours_that_can_be_trained():
         assert len(build(config, (points, one)).features_dc.unique()) == 2, "dark points among others stay"
 
 
-def test_a_run_that_cannot_start_leaves_no_folder(tmp_path, wall_config, run_training):
-    config = wall_config(tmp_path / "no_such_scene", tmp_path / "outputs", steps=5)
-    (tmp_path / "outputs").mkdir()
-    (tmp_path / "outputs" / "of another run").mkdir()
-    with pytest.raises(DataError, match="no_such_scene"):
-        run_training(config)
-    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["of another run"]
-
-
 @pytest.fixture(scope="module")
 def trained(wall_scene, wall_config, run_training, tmp_path_factory):
     """A short run on the painted wall: its config, its trainer and its losses."""
