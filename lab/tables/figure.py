@@ -39,12 +39,8 @@ def distributions(scene: Gaussians) -> tuple[list[int], list[int]]:
 
 def share_of_figure(cells: dict[str, Row], names: list[str]) -> float:
     """The paper's share where the paper's selection was measured at it, or else the largest measured share."""
-    shares = {
-        share
-        for key, cell in cells.items()
-        for share in [cell["point"]["share"]]
-        if cell["way"] == WAYS.paper.name and cell["opacities"] and key.split("/")[0] in names
-    }
+    keys = {key for key, cell in cells.items() if cell["way"] == WAYS.paper.name and cell["opacities"]}
+    shares = {cells[key]["point"]["share"] for key in keys if key.split("/")[0] in names}
     return PROTOCOL.figure_share if PROTOCOL.figure_share in shares else max(shares, default=PROTOCOL.figure_share)
 
 

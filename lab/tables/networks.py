@@ -45,7 +45,7 @@ TRAININGS = {
         },
     ),
 }
-"""Trainings by name. "paper" needs a GPU; "small" is for a night of two CPU cores, and not the published one."""
+"""Trainings by name. "paper" needs a GPU; "small" is for CPUs, and not the published one."""
 
 
 @dataclass(frozen=True)
