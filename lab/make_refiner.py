@@ -1,18 +1,18 @@
-"""Makes a refiner from nothing: rooms, scenes trained on them, refiner training, evaluation, card.
+"""Makes a refiner from nothing: rooms, scenes trained on them, refiner training, evaluation.
 
-It did not make the refiner that ships, whose card in ``pointsplat_ns/refiner/pretrained`` names its scenes.
+It did not make the refiner that ships, whose card in ``pointsplat_ns/refiner/pretrained`` names its scenes. The scenes
+that it makes also serve ``python -m lab.tables.networks``.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -30,9 +30,7 @@ from lab.common.running import (
 )
 from lab.rooms import write_room
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES
-from pointsplat_ns.refiner import read_metadata, read_refiner, save_refiner
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,6 @@ RECIPE = RecipeSettings()
 
 def main(
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs/make-refiner"),
-    weights: Path | None = None,
     size: Literal["tiny", "small", "full"] = "tiny",
     steps: int = 700,
     rooms: int | None = None,
@@ -67,7 +64,6 @@ def main(
 
     Args:
         output: folder for all results.
-        weights: folder for refiner.safetensors and CARD.md; by default the output folder.
         size: size of the network.
         steps: training steps of the network.
         rooms: number of rooms to train on; by default all.
@@ -88,27 +84,8 @@ def main(
         remove_interrupted(trained)
         run(refiner_command(output / "scenes", output / "refiners", name, RECIPE.timestamp, size, steps, seed))
     run(evaluate_command(trained, evaluation, pictures))
-    results = json.loads(evaluation.read_text("utf-8"))["results"]
-
-    options = "" if rooms is None else f" --rooms {rooms}"
-    about = {
-        "command": f"python -m lab.make_refiner --size {size} --steps {steps} --seed {seed}{options}",
-        "by": "merge",
-        "keep": RECIPE.keep,
-        "steps": steps,
-        "scenes": [f"room{seed}" for seed in train_seeds],
-        "unseen": results["average_unseen"],
-    }
-    target = weights or output
-    refiner = read_refiner(trained / RUN_FILES.refiner)
-    save_refiner(refiner, target / RUN_FILES.refiner, {**read_metadata(trained / RUN_FILES.refiner), **about})
-    command = refiner_command(Path("scenes"), Path("refiners"), name, RECIPE.timestamp, size, steps, seed)
-    with replacing(target / "CARD.md") as part:
-        parameters = sum(p.numel() for p in refiner.parameters())
-        part.write_text(card_text(about, results, command, parameters), encoding="utf-8")
-    print(f"{target / RUN_FILES.refiner}: the refiner")
-    print(f"{target / 'CARD.md'}: its training and results")
-    print(f"{pictures}: photo, dense, pruned and refined side by side")
+    print(f"{trained / RUN_FILES.refiner}: the refiner")
+    print(f"{evaluation}, {pictures}: PSNR, SSIM, LPIPS; photo, dense, pruned and refined side by side")
 
 
 def _make_scenes(output: Path, seeds: tuple[int, ...], workers: int) -> None:
@@ -209,50 +186,6 @@ def refiner_command(scenes: Path, output: Path, name: str, timestamp: str, size:
     }
     unseen = tuple(f"room{seed}" for seed in RECIPE.unseen_seeds)
     return train_refiner_command(scenes, output, name, steps, timestamp, unseen, options)
-
-
-def card_text(about: dict[str, Any], results: dict[str, Any], command: str, parameters: int) -> str:
-    """A model card in Markdown, of the metadata of the weights, the results of ``ns-eval``, the command that trained
-    the refiner, and the number of the network's parameters."""
-    rows = []
-    for name, scene in results["scenes"].items():
-        if not scene["seen_in_training"]:
-            rows += [_row(name, variant, scene[variant]) for variant in ("dense", "pruned", "refined")]
-    rows += [_row("**mean of these**", v, results["average_unseen"][v]) for v in ("dense", "pruned", "refined")]
-    return f"""# A refiner from built-in rooms
-
-A network of {parameters:,} parameters ({results["settings"]["size"]}, dual-branch encoder) that repairs 3D Gaussian
-Splatting scenes after they were merged to {100 * about["keep"]:g} % of their Gaussians. One forward pass, no photos.
-
-- **Data:** {len(about["scenes"])} furnished rooms that `python -m lab.rooms` draws ({about["scenes"][0]} to
-  {about["scenes"][-1]}: size, furniture, textures, lights, path and size of the pictures all differ), each trained with
-  `splatfacto-cpu` at settings of its own (`lab/make_refiner.py`). No
-  downloaded data.
-- **Made by:** `{about["command"]}`
-- **Training:** {about["steps"]:,} steps, each one scene and two views, against the dense scene's own renders. The
-  command inside, in its output folder:
-
-```
-{command}
-```
-
-- **Results** on rooms that it was never trained on, held-out photos, {100 * about["keep"]:g} % kept:
-
-| scene | variant | PSNR dB | SSIM | LPIPS | Gaussians |
-|---|---|---|---|---|---|
-{chr(10).join(rows)}
-
-- **Limits:** trained on small rooms seen in small pictures. `pointsplat compact` compares renders before and after
-  with those of the dense scene, and leaves the refinement out where it does not help.
-- **Licence:** Apache-2.0, as the package.
-"""
-
-
-def _row(scene: str, variant: str, values: dict[str, Any]) -> str:
-    lpips = "-" if values["lpips"] is None else f"{values['lpips']:.3f}"
-    return (
-        f"| {scene} | {variant} | {values['psnr']:.2f} | {values['ssim']:.3f} | {lpips} | {values['gaussians']:,.0f} |"
-    )
 
 
 if __name__ == "__main__":

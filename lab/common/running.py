@@ -92,7 +92,8 @@ def _status(
 ) -> int:
     """Run a program until it ends, and give its exit status. It does not outlive an exception here."""
     errors = None if output is None else subprocess.STDOUT
-    with subprocess.Popen(words, env=environment, stdout=output, stderr=errors) as process:
+    # A session of its own: Ctrl-C would reach it twice, and a training saves its last step on the first signal alone.
+    with subprocess.Popen(words, env=environment, stdout=output, stderr=errors, start_new_session=True) as process:
         try:
             while stop is None or not stop.is_set():
                 try:
@@ -103,8 +104,8 @@ def _status(
         except BaseException:
             process.terminate()
             try:
-                process.wait(5.0)  # s to end after the signal; then it is killed
-            except subprocess.TimeoutExpired:
+                process.wait(600.0)  # s to end a step and save after the signal
+            except BaseException:  # also a second Ctrl-C
                 process.kill()
             raise
 
@@ -133,12 +134,14 @@ def train_refiner_command(
     timestamp: str,
     eval_scenes: tuple[str, ...] = (),
     options: TrainOptions | None = None,
+    method: str = METHOD_NAMES.refiner,
 ) -> str:
     """The command that trains a refiner on all scenes below the folder ``scenes``, but for those named in
-    ``eval_scenes``. The run goes to :func:`folder_of_run`; ``options`` are further ones of the method."""
+    ``eval_scenes``, by a method or a preset of it. The run goes to :func:`folder_of_run`; ``options`` are further ones
+    of the method."""
     held_out = {"pipeline.datamanager.eval-scenes": eval_scenes} if eval_scenes else {}
     options = {"data": scenes, **held_out, **(options or {})}
-    return shlex.join(_train_words(METHOD_NAMES.refiner, output, name, steps, timestamp, options))
+    return shlex.join(_train_words(method, output, name, steps, timestamp, options))
 
 
 def evaluate_command(run: Path, evaluation: Path, pictures: Path) -> str:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 import pandas as pd
@@ -14,7 +15,7 @@ import pandas as pd
 from lab.common.printing import markdown, number, percent
 from lab.common.results import Row
 from lab.tables.cells import FILES, Tables
-from lab.tables.figure import medians, plot_figure
+from lab.tables.figure import medians, plot_figure, share_of_figure
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key, published
 from pointsplat_ns.io.files import replacing, three_digits
 
@@ -22,7 +23,8 @@ READING = (
     "Figures are means over the same scenes in all rows of a table, but for rows with a mark. PSNR (dB), SSIM and "
     'LPIPS (AlexNet) are against held-out photos; those of "renders" against the dense scene\'s own renders in the '
     'same poses. "Loses most" names the scene that loses most PSNR compared to its dense scene, with its PSNR and the '
-    "difference; among dense scenes it is the one of the least PSNR. \\*: nothing is fine-tuned or refined. Frames a "
+    "difference; among dense scenes it is the one of the least PSNR. The spread is the standard deviation of PSNR over "
+    "trainings that differ by their seed. \\*: nothing is fine-tuned or refined. Frames a "
     "second compare on an idle machine alone."
 )
 
@@ -45,7 +47,7 @@ class Table:
     header: tuple[str, ...]
     rows: list[tuple[str, ...]]
     notes: list[str]
-    """Lines below the table: what rows were made with, missing cells, and the reasons."""
+    """Lines below the table: missing cells, and the reasons."""
 
 
 class Layout:
@@ -93,11 +95,13 @@ class Layout:
         theirs = {cell: published(which, dataset, cell[0].name, cell[1]) for cell in cells}
         kinds = (["photos"] if self.has_photos else []) + ["renders"]
         heads = [name.upper() + " (renders)" * (kind == "renders") for kind in kinds for name in WRITTEN]
-        heads += ["loses most", "scenes"] + ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
+        spread, paper = ["spread"] * (which == 4), ["PSNR (paper)", "SSIM (paper)"] * any(theirs.values())
+        heads += [*spread, "loses most", "made with", "scenes", *paper]
 
         def figures(same: pd.DataFrame, mean: pd.Series) -> list[str]:
             found = [_text(write, mean[f"{kind}_{name}"]) for kind in kinds for name, write in WRITTEN.items()]
-            return [*found, _worst(same)]
+            found += [_spread(same)] * (which == 4)
+            return [*found, _worst(same), ", ".join(dict.fromkeys(map(_made, same["made_with"])))]
 
         def more(cell: Cell) -> list[str]:
             known = (theirs[cell] or (None, None))[:2]
@@ -153,24 +157,21 @@ class Layout:
         )
 
     def _notes(self, cells: list[Cell]) -> list[str]:
-        """The networks and steps that rows were made with, and reasons for missing cells, each once."""
+        """Reasons for missing cells, each once."""
         found: dict[str, dict[str, None]] = {}
         for way, share in cells:
             for name in self.names:
-                key, label = cell_key(name, way, share), f"{way.label} ({percent(share)})"
-                if key not in self.cells:
-                    why = f"Not measured, {self.all.missing.get(key, 'not yet')}"
+                if (key := cell_key(name, way, share)) not in self.cells:
+                    label, why = f"{way.label} ({percent(share)})", self.all.missing.get(key, "not yet")
                     found.setdefault(why, {})[label if len(self.names) == 1 else f"{label} on {name}"] = None
-                elif (with_what := self.cells[key]["made_with"]) and (way.network is not None or way.fine_tuned):
-                    found.setdefault(f"Made with {with_what}", {})[label] = None
-        return [f"{why}: {', '.join(labels)}" for why, labels in found.items()]
+        return [f"Not measured, {why}: {', '.join(labels)}" for why, labels in found.items()]
 
     def _medians(self) -> list[Table]:
         found = medians(self.cells, list(self.names))
-        title = f"Medians of Figure 4: {self.group}, {percent(PROTOCOL.figure_share)} kept"
+        title = f"Medians of Figure 4: {self.group}, {percent(share_of_figure(self.cells, list(self.names)))} kept"
         rows = [
             (way.label, f"{found[way.name][0]:.2f}", f"{found[way.name][1]:.1f}")
-            for way, _ in WAYS.figure_4
+            for way in WAYS.figure_4
             if way.name in found
         ]
         return [Table(0, title, ("method", "opacity", "log10 of the volume"), rows, [])] if rows else []
@@ -188,11 +189,31 @@ def _flat(key: str, cell: Row) -> Row:
     for kind, target in (("renders", "against_dense"), ("photos", "against_photos")):
         found = point[target] or {}
         row |= {f"{kind}_{name}": float("nan") if (v := found.get(name)) is None else v for name in WRITTEN}
-    return row | {"frame_ms": point["frame_ms"]}
+    more = {"trainings": cell.get("psnr", []), "made_with": cell["made_with"]}
+    return row | {"frame_ms": point["frame_ms"], **more}
 
 
 def _text(write: Any, value: float | None) -> str:
     return "-" if value is None or pd.isna(value) else write(value)
+
+
+_TRAINED = re.compile(
+    r"(\w+) encoder.*?keep ([^;)]+).*?size (\w+), steps ([^,;)]+).*?pixel loss (\w+), lpips weight ([\d.]+)"
+)
+
+
+def _made(made_with: str) -> str:
+    """Encoder, size, steps, budget and loss of the networks that a cell was made with; or its first words."""
+    if (found := _TRAINED.search(made_with)) is None:
+        return made_with.split(" (")[0]
+    encoder, keep, size, steps, loss, weight = found.groups()
+    return f"{encoder} {size}, {steps} steps, keep {keep}, {loss} + {weight} LPIPS"
+
+
+def _spread(same: pd.DataFrame) -> str:
+    """Standard deviation over trainings of the mean PSNR of scenes; a dash for one training."""
+    trainings = list(zip(*same["trainings"], strict=False))
+    return f"{stdev(map(fmean, trainings)):.2f}" if len(trainings) > 1 else "-"
 
 
 def _worst(same: pd.DataFrame) -> str:

@@ -26,6 +26,7 @@ from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Examp
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
+from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.pruning import method_named, resolve_keep, score_of, select
 from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT
@@ -59,20 +60,14 @@ class Tools:
         if way.mode is not None:
             return self.peer.modes[way.mode].label
         if way.network is not None:
-            return self.weights(way.network, share, scene).text
+            return made_with(self.refiners.find(way.network, share, scene)[0])
         return f"{self.options.fine_tune} steps" if way.fine_tuned else ""
-
-    def weights(self, network: Network, share: float, scene: str) -> Weights:
-        """The weights of a measurable cell."""
-        weights, _ = self.refiners.find(network, share, scene)
-        assert weights is not None
-        return weights
 
     def words(self, way: Way, share: float, scene: str) -> list[str]:
         """The options of the command that measures a cell with the same tools."""
         words = self.options.words
         if way.network is not None:
-            words += ["--refiners", str(self.weights(way.network, share, scene).path)]
+            words += ["--refiners", *(str(each.path) for each in self.refiners.find(way.network, share, scene)[0])]
         if way.mode is not None and self.program:
             words += ["--splat-transform", self.program]
         return words
@@ -85,31 +80,32 @@ class Maker:
         self.scene, self.name, self.tools = scene, name, tools
         self._scores: dict[tuple[str, float | None], tuple[Tensor, float]] = {}
 
-    def make(self, way: Way, share: float) -> tuple[Gaussians, float]:
-        """The scene of a measurable cell, and the seconds of making it, with those of scores that other cells share.
-        Raises ProgramFailed if another program fails, SceneError if its result cannot be read or the SH degree exceeds
-        the refiner's, and DataError if there are no views."""
+    def make(self, way: Way, share: float) -> tuple[list[Gaussians], float]:
+        """The scene of a measurable cell, one of each network where several fit, and the seconds of making one, with
+        those of scores that other cells share. Raises ProgramFailed if another program fails, SceneError if its result
+        cannot be read or the SH degree exceeds the refiner's, and DataError if there are no views."""
         dense, start = self.scene.dense, time.perf_counter()
         if way == WAYS.dense:
-            return dense, 0.0
+            return [dense], 0.0
         count, path, data = resolve_keep(len(dense), share, dense.sh_degree), self.scene.path, self.scene.data
         if way.mode is not None:
             with tempfile.TemporaryDirectory() as folder:
                 write_ply(dense, Path(folder) / "dense.ply")
                 scene, usage = self.tools.peer.modes[way.mode].reduce(Path(folder) / "dense.ply", count, timeout=7200.0)
-            return scene.to(dense.device), usage.seconds
+            return [scene.to(dense.device)], usage.seconds
         if way.repaired:
-            return ps.compact(path, count, data=data).scene, time.perf_counter() - start
+            return [ps.compact(path, count, data=data).scene], time.perf_counter() - start
         if method_named(way.by).score is None:
-            return ps.prune(path, count, way.by, data=data), time.perf_counter() - start
+            return [ps.prune(path, count, way.by, data=data)], time.perf_counter() - start
         scores, before = self._scored(way)
         start = time.perf_counter()
         scene = dense[select(scores, count)]
+        made = [scene]
         if way.network is not None:
-            scene = self.tools.weights(way.network, share, self.name).refiner(scene)
+            made = [each.refiner(scene) for each in self.tools.refiners.find(way.network, share, self.name)[0]]
         if way.fine_tuned:
-            scene = fine_tuned(scene, dense, self.scene, self.tools.options.fine_tune)
-        return scene, before + time.perf_counter() - start
+            made = [fine_tuned(scene, dense, self.scene, self.tools.options.fine_tune)]
+        return made, before + (time.perf_counter() - start) / len(made)
 
     def _scored(self, way: Way) -> tuple[Tensor, float]:
         """Scores (N,), and the seconds of computing them."""
@@ -149,7 +145,7 @@ class Weights:
     """Names of training scenes; empty if they are not known."""
     keeps: tuple[float, ...]
     """Budgets of the training: shares, or counts above 1."""
-    training: str
+    training: dict[str, Any]
     """How the network was trained, as far as its file says: steps, loss, rates, supervision."""
 
     @cached_property
@@ -167,51 +163,65 @@ class Weights:
         return Network(config.encoder, settings.by, weight, config.use_appearance, config.use_position)
 
     @property
-    def text(self) -> str:
-        """One line that identifies the weights."""
-        parameters = sum(parameter.numel() for parameter in self.refiner.network.parameters())
-        keeps = ", ".join(f"{keep:g}" for keep in self.keeps)
-        norm = self.refiner.network.config.norm
-        words = [f"{parameters:,} parameters", f"norm by {norm}", f"{self.network}, keep {keeps}"]
-        words += [self.training] if self.training else []
-        words += [f"{len(self.trained_on)} scenes"] if self.trained_on else []
-        return f"weights {self.digest} ({'; '.join(words)})"
+    def kind(self) -> tuple:
+        """What trainings that differ by their seed alone have in common."""
+        known = {name: value for name, value in self.training.items() if name != "steps"}  # a time has its own steps
+        return self.refiner.network.config, self.network, self.keeps, self.trained_on, known
+
+
+def made_with(all_weights: Sequence[Weights]) -> str:
+    """One line that identifies weights of one kind."""
+    first, digests = all_weights[0], ", ".join(weights.digest for weights in all_weights)
+    parameters = sum(parameter.numel() for parameter in first.refiner.network.parameters())
+    keeps = ", ".join(f"{keep:g}" for keep in first.keeps)
+    words = [f"{parameters:,} parameters", f"norm by {first.refiner.network.config.norm}"]
+    words += [f"{first.network}, keep {keeps}"]
+    said = {name: dict.fromkeys(weights.training[name] for weights in all_weights) for name in first.training}
+    known = (f"{name.replace('_', ' ')} {' / '.join(map(str, values))}" for name, values in said.items())
+    words += [", ".join(known)] if said else []
+    words += [f"{len(first.trained_on)} scenes"] if first.trained_on else []
+    return f"weights {digests} ({'; '.join(words)})"
 
 
 class Refiners:
     """Weights to choose from; paths and errors are those of :func:`pointsplat_ns.load_refiner`."""
 
     def __init__(self, paths: Sequence[Path]):
-        self.all = tuple(map(_read, paths))
+        self.all = tuple(_read(path) for given in paths for path in _trained(given))
 
-    def find(self, network: Network, share: float, scene: str) -> tuple[Weights | None, str]:
+    def find(self, network: Network, share: float, scene: str) -> tuple[list[Weights], str]:
         """The weights for a row (the needed network, a share of the Gaussians, the name of a scene), or the reason for
-        none. They were trained for this network and this share, and not on the scene itself. Of several, the first is
-        taken."""
+        none. They were trained for this network and this share, and not on the scene itself. Of several kinds the first
+        is taken; those of a kind differ by their seed."""
         fitting = [
             weights
             for weights in self.all
             if weights.network == network and any(math.isclose(keep, share, rel_tol=1e-3) for keep in weights.keeps)
         ]
-        for weights in fitting:
-            if scene not in weights.trained_on:
-                return weights, ""
+        if unseen := [weights for weights in fitting if scene not in weights.trained_on]:
+            return [weights for weights in unseen if weights.kind == unseen[0].kind], ""
         if fitting:
-            return None, f"its weights ({fitting[0].path}) were trained on this scene"
+            return [], f"its weights ({fitting[0].path}) were trained on this scene"
         missing = f"no weights were given (--refiners) of a {network}, to {100 * share:g} %"
-        return None, f"{missing}; to train them: {network.command(share)}"
+        return [], f"{missing}; to train them: {network.command(share)}"
+
+
+def _trained(path: Path) -> list[Path]:
+    """Finished trainings below a folder that is no run itself; or the path."""
+    if path.is_dir() and not (path / RUN_FILES.config).is_file():
+        return sorted(file.parent for file in path.glob(f"*/*/*/{RUN_FILES.refiner}")) or [path]
+    return [path]
 
 
 def _read(path: Path) -> Weights:
-    inside = path / "refiner.safetensors"  # of a finished training; a checkpoint does not name its training scenes
+    inside = path / RUN_FILES.refiner  # of a finished training; a checkpoint does not name its training scenes
     file = inside if path.is_dir() and inside.is_file() else path
     metadata = read_metadata(file) if file.suffix.lower() == ".safetensors" else {}
     refiner = load_refiner(file)
     more = metadata.get("more_keeps")
     more = [keep for keep in more if isinstance(keep, (int, float))] if isinstance(more, list) else []
     known = {name: metadata[name] for name in TRAINING_SETTINGS if isinstance(metadata.get(name), (str, int, float))}
-    training = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
-    return Weights(path, refiner, _names(metadata.get("scenes")), (refiner.settings.keep, *more), training)
+    return Weights(path, refiner, _names(metadata.get("scenes")), (refiner.settings.keep, *more), known)
 
 
 TRAINING_SETTINGS = (

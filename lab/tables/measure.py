@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -80,15 +80,24 @@ def measured(scene: OpenedScene, output: Path, way: Way, share: float, maker: Ma
     """The cell of a scene, a way and a share of its Gaussians. ``point`` has its figures, and the command that measures
     it again."""
     name, tools = maker.name, maker.tools
-    small, seconds = maker.make(way, share)
+    made, seconds = maker.make(way, share)
+    small, figures = made[0], [judge.figures(each) for each in made]
     key, size = cell_key(name, way, share), ply_bytes(len(small), small.sh_degree)
     words = [str(scene.path), "-o", str(output), "--only", key, *tools.words(way, share, name)]
     point = {"key": key, "label": way.label, "command": shlex.join(["python", "-m", "lab.tables", *words])}
     point |= {"share": share, "gaussians": len(small), "sh_degree": small.sh_degree, "bytes": size, "seconds": seconds}
-    opacities, volumes = distributions(small) if (way, share) in WAYS.figure_4 else (None, None)
-    cell: Row = {"way": way.name, "point": point | judge.figures(small)}
+    opacities, volumes = distributions(small) if way in WAYS.figure_4 else (None, None)
+    cell: Row = {"way": way.name, "point": point | _mean(figures)}
+    cell["psnr"] = [(found["against_photos"] or found["against_dense"])["psnr"] for found in figures]
     cell |= {"made_with": tools.made_with(way, share, name), "seed": PROTOCOL.seed, "commit": source_commit()}
     return cell | {"version": pointsplat_ns.__version__, "opacities": opacities, "volumes": volumes}
+
+
+def _mean(found: Sequence[Any]) -> Any:
+    """The mean over networks of figures, which are numbers or rows of them; None where there is none."""
+    if isinstance(found[0], dict):
+        return {name: _mean([figures[name] for figures in found]) for name in found[0]}
+    return None if found[0] is None else fmean(found)
 
 
 def measure_tables(
@@ -117,8 +126,8 @@ def measure_tables(
             files of scenes.
         output: folder for tables.json with all cells, tables.md, tables.tex and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
-        refiners: weights for the rows with a network: runs or .safetensors files. Each row takes those with fitting
-            metadata.
+        refiners: weights for the rows with a network: runs, .safetensors files, or folders above runs. Each row takes
+            those with fitting metadata; of those that differ by their seed, the mean.
         groups: NAME=SCENE,SCENE...; means are taken over groups.
         only: names or patterns of cells, such as fox/merge/10%. Only these are measured, also if they were before.
         views: largest number of held-out views of a scene.

@@ -25,7 +25,7 @@ class Protocol:
     dense_steps: int = 15_000
     """Number of Splatfacto's steps for a dense scene."""
     figure_share: float = 0.5
-    """Share of the Gaussians in Figure 4."""
+    """Share of the Gaussians in Figures 3 and 4."""
     seed: int = 0
     """Seed of the order of views in fine-tuning, and of random selection. No other step is random."""
 
@@ -51,19 +51,23 @@ class Network:
         words = f"{self.encoder} encoder" + (f" without {without}" if without else "")
         return f"{words}, trained on scenes pruned by {self.by}{weight}"
 
+    def options(self, share: float) -> dict[str, str]:
+        """The options of ``ns-train pointsplat`` that make such a network for a share of the Gaussians."""
+        options = {"encoder": self.encoder, "by": self.by, "keep": f"{share:g}"}
+        options |= {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
+        options |= {} if self.use_appearance else {"use-appearance": "False"}
+        options |= {} if self.use_position else {"use-position": "False"}
+        return {f"pipeline.model.{name}": value for name, value in options.items()}
+
     def command(self, share: float) -> str:
-        """The command that trains such a network for a share of the Gaussians, on scenes of the user's choice.
+        """The command that trains such a network on scenes of the user's choice.
 
         Example:
             >>> Network("concat", "random", None).command(0.3)
             'ns-train pointsplat --data SCENES --pipeline.model.encoder concat --pipeline.model.by random \
 --pipeline.model.keep 0.3'
         """
-        options = {"encoder": self.encoder, "by": self.by, "keep": f"{share:g}"}
-        options |= {} if self.opacity_weight is None else {"opacity-weight": f"{self.opacity_weight:g}"}
-        options |= {} if self.use_appearance else {"use-appearance": "False"}
-        options |= {} if self.use_position else {"use-position": "False"}
-        words = " ".join(f"--pipeline.model.{name} {value}" for name, value in options.items())
+        words = " ".join(f"--{name} {value}" for name, value in self.options(share).items())
         return f"ns-train pointsplat --data SCENES {words}"
 
 
@@ -151,10 +155,9 @@ class Ways:
         return (self.paper, *ablated, self.pointsplat)
 
     @property
-    def figure_4(self) -> tuple[tuple[Way, float], ...]:
-        """Ways and shares in Figure 4: the dense scene, the paper's three, and the default of this package."""
-        smaller = (self.lightgaussian, self.pup, self.paper, self.merge)
-        return ((self.dense, 1.0), *((way, PROTOCOL.figure_share) for way in smaller))
+    def figure_4(self) -> tuple[Way, ...]:
+        """Ways in Figure 4: the dense scene, the paper's three, and the default of this package."""
+        return (self.dense, self.lightgaussian, self.pup, self.paper, self.merge)
 
     def cells(self, shares: Sequence[float]) -> list[tuple[Way, float]]:
         """Every way and share of all tables, those of Table 1 given, each once, in the order of measurement: quick ones

@@ -30,7 +30,7 @@ def add_scene(tables, name, group="scenes", dataset="", worse=0.0, photos=True, 
         cell = {"way": way.name, "point": point, "made_with": "", "seed": 0, "version": "0.1.0", "commit": ""}
         for kind, edges in (("opacities", OPACITY_EDGES), ("volumes", VOLUME_EDGES)):
             counts = [0] * 9 + [7] + [0] * (len(edges) - 11)
-            cell[kind] = counts if (way, share) in WAYS.figure_4 else None
+            cell[kind] = counts if way in WAYS.figure_4 else None
         tables.cells[key] = cell
     return tables
 
@@ -63,7 +63,7 @@ def test_tables_have_the_papers_rows():
     one, two, three, four = tables_of(tables)
     assert len(one.rows) == 25 and one.header[:5] == ("kept", "method", "PSNR", "SSIM", "LPIPS")
     first, merged = rows_of(one), photos_psnr(tables, "fox/merge/10%")
-    assert first["100 %", "3DGS (dense)"] == ("30.00", "0.800", "0.200", "-", "0.900", "0.100", "fox 30.00", "1")
+    assert first["100 %", "3DGS (dense)"] == ("30.00", "0.800", "0.200", "-", "0.900", "0.100", "fox 30.00", "", "1")
     row = first["10 %", "merge (our default)"]
     assert (row[0], row[6]) == (f"{merged:.2f}", f"fox {merged:.2f} ({merged - 30:+.2f})")
     assert rows_of(two)["10 %", "PUP-3DGS"] == ("100", "1e+03", "0.0248", "1")

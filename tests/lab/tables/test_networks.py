@@ -1,0 +1,115 @@
+"""All networks of the tables: trained by one command that resumes, then measured and drawn."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+
+import pointsplat_ns as ps
+from lab.tables import figures, networks
+from lab.tables.networks import jobs
+from lab.tables.ways import WAYS
+from making import box_room, parsed_by_ns_train
+from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.refiner import Refiner, preset, read_metadata
+from pointsplat_ns.refiner.weights import save_refiner
+
+NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
+"""Shards of one network each."""
+
+
+def written(command: str, log: Path) -> None:
+    """In place of a training: weights with the metadata of one, by the options of its command."""
+    words = shlex.split(command)
+    given = {word[2:]: words[i + 1] for i, word in enumerate(words) if word.startswith("--")}
+    model = {key.rpartition(".")[2]: value for key, value in given.items() if ".model." in key}
+    switches = {name.replace("-", "_"): False for name in model if name.startswith("use-")}
+    torch.manual_seed(int(given["pipeline.datamanager.seed"]))
+    network = Refiner(preset(model["size"], encoder=model["encoder"], **switches))
+    with torch.no_grad():
+        [*network.heads.mlps["opacities"].modules()][-1].bias.fill_(0.3 * torch.rand(()))
+    weight = {"opacity_weight": float(model["opacity-weight"])} if "opacity-weight" in model else {}
+    known = {"by": model["by"], "keep": float(model["keep"]), **weight, "scenes": "wall-a"}
+    known |= {"size": model["size"], "steps": int(given["max-num-iterations"]), "pixel_loss": model["pixel-loss"]}
+    known["lpips_weight"] = float(model["lpips-weight"])
+    folder = Path(given["output-dir"]) / given["experiment-name"] / "pointsplat" / given["timestamp"]
+    save_refiner(network, folder / "refiner.safetensors", known)
+
+
+def test_there_are_sixteen_networks_and_seeds_are_of_table_4():
+    assert len(NUMBER) == 16 and len({job.name for job in jobs(3)}) == 16 + 2 * 4
+    assert {job.way.name for job in jobs(2)[16:]} == {"pointsplat", "pointsplat-ii", "pointsplat-iii", "pointsplat-iv"}
+    assert {job.share for job in jobs() if job.way == WAYS.splatformer} == {0.5, 0.3, 0.1}
+
+
+@pytest.fixture()
+def small(trained_walls, tmp_path, no_lpips):
+    """A function that trains networks of size tiny for three steps, never on wall-b."""
+
+    def train(**options):
+        usual = {"held_out": ("wall-b",), "size": "tiny", "steps": 3}
+        networks.main(trained_walls, tmp_path / "networks", **usual | options)
+
+    return train
+
+
+def test_an_interrupted_training_goes_on_where_it_was(small, run_training, tmp_path, monkeypatch):
+    asked = []
+
+    def train(command: str, log: Path) -> None:
+        config = parsed_by_ns_train(command)
+        config.pipeline.datamanager.data = config.data
+        asked.append((config.max_num_iterations, config.load_dir))
+        if len(asked) == 1:  # stopped after two steps, as by Ctrl-C: with a checkpoint, without weights
+            config.max_num_iterations = 2
+        run_training(config)
+        if len(asked) == 1:
+            (config.get_base_dir() / "refiner.safetensors").unlink()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(networks, "run", train)
+    with pytest.raises(KeyboardInterrupt):
+        small(shard=NUMBER["pointsplat-iii-10"])
+    small(shard=NUMBER["pointsplat-iii-10"])
+    small(shard=NUMBER["pointsplat-iii-10"])  # which finds it finished
+    folder = tmp_path / "networks" / "pointsplat-iii-10" / "pointsplat" / "run"
+    assert asked == [(3, None), (1, folder / "nerfstudio_models")]
+    known = read_metadata(folder / "refiner.safetensors")
+    assert (known["steps"], known["scenes"], known["size"]) == (3, "wall-a", "tiny")
+    assert (known["by"], known["keep"], known["pixel_loss"]) == ("paper", 0.1, "rmse")
+
+
+def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "run", written)
+    for shard in ("1/2", "2/2"):
+        small(shard=shard, seeds=2)
+    trained = tmp_path / "networks"
+    monkeypatch.setattr(networks, "run", lambda *_: pytest.fail("all are finished"))
+    small(seeds=2)
+    ps.save(box_room(1, 300), tmp_path / "hall.ply")
+    only = [f"*/{way.name}/*" for way, _ in WAYS.cells((0.5, 0.3, 0.1)) if way.network or way in WAYS.figure_4]
+    tables = measured(tmp_path / "hall.ply", refiners=[trained], only=only, keeps=(0.5, 0.3, 0.1))
+    assert tables.missing == {} and len({cell["way"] for cell in tables.cells.values()}) == len(set(only))
+    both = tables.cells["hall/pointsplat-ii/10%"]
+    assert len(both["psnr"]) == 2 and both["made_with"].count("steps 3") == 1 and "size tiny" in both["made_with"]
+    assert both["point"]["against_dense"]["psnr"] == pytest.approx(sum(both["psnr"]) / 2)
+    page = (tmp_path / "tables" / "tables.md").read_text()
+    [row] = [line.split(" | ") for line in page.splitlines() if line.startswith("| II |")]
+    assert row[-4] == f"{abs(both['psnr'][0] - both['psnr'][1]) / 2**0.5:.2f}"  # the spread of two
+    assert row[-2] == "dual tiny, 3 steps, keep 0.1, rmse + 0.05 LPIPS"
+    for number in (1, 3, 4, 5):
+        target = tmp_path / f"figure{number}.png"
+        figures.main(number, (tmp_path / ("tables" if number == 4 else "hall.ply"),), target, refiners=(trained,))
+        assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 10_000
+
+
+def test_a_figure_without_its_network_names_the_command_that_trains_it(room, tmp_path):
+    with pytest.raises(PointSplatError, match="room: PointSplat cannot be drawn: no weights .*ns-train pointsplat"):
+        figures.main(1, (room,), tmp_path / "figure1.png")
+
+
+@pytest.mark.parametrize("shard", ["", "3", "0/2", "3/2", "a/b"])
+def test_a_shard_that_is_none_is_refused(shard, tmp_path):
+    with pytest.raises(PointSplatError, match="expected I/N such as 1/3"):
+        networks.main(tmp_path, tmp_path / "networks", shard=shard)

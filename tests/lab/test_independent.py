@@ -1,0 +1,76 @@
+"""The lab's own recomputation of scores and encoder, against the package."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+
+import pointsplat_ns as ps
+from lab import independent
+from making import box_room
+from pointsplat_ns.gaussians import Gaussians
+
+
+def uneven(room: Gaussians) -> Gaussians:
+    """The room with Gaussians of different sizes, opacities and colours that depend on the direction."""
+    rng = np.random.default_rng(5)
+
+    def noise(*shape):
+        return room.means.new_tensor(rng.normal(size=shape))
+
+    n = len(room)
+    rest = 0.2 * noise(n, 15, 3)
+    scales, opacities = room.scales + 0.5 * noise(n, 3), room.opacities + noise(n, 1)
+    return room.replace(features_rest=rest, scales=scales, opacities=opacities, quats=noise(n, 4))
+
+
+def test_the_package_agrees_with_a_recomputation_of_its_own(tmp_path, capsys):
+    ps.save(uneven(box_room(0, 300)), tmp_path / "room.ply")
+    lines = independent.main(tmp_path / "room.ply", views=5, width=64)
+    assert "dual-branch encoder's output" in capsys.readouterr().out
+    for what, count, median, largest, kept in lines:
+        # 1e-9: some thousand terms in float64, in another order; determinants have condition numbers up to 1e8
+        assert float(median) <= 1e-9 and float(largest) <= (1e-5 if "where determined" in what else 1e-8), what
+        assert kept in ("-", "100, 100, 100"), what
+        assert int(count.replace(",", "")) >= (50 if "where determined" in what else 30), what
+
+
+def test_the_recomputation_notices_another_definition(monkeypatch, tmp_path):
+    ps.save(uneven(box_room(0, 300)), tmp_path / "room.ply")
+    mine = independent.read_ply(tmp_path / "room.ply")
+    by_scales = independent.pup_hessians
+    monkeypatch.setattr(  # by standard deviations, as the package had it once
+        independent, "pup_hessians", lambda scene, cameras: by_deviations(by_scales(scene, cameras), scene)
+    )
+    lines = independent.main(tmp_path / "room.ply", views=5, width=64)
+    [score] = [line for line in lines if line[0].startswith("PUP-3DGS's score")]
+    assert float(score[2]) > 0.01 and score[4] != "100, 100, 100" and len(mine.means) == 300
+
+
+def by_deviations(blocks: np.ndarray, scene: independent.Splats) -> np.ndarray:
+    factors = np.concatenate([np.ones_like(scene.means), np.exp(-scene.log_scales)], axis=1)
+    return blocks * factors[:, :, None] * factors[:, None]
+
+
+def test_what_is_recomputed_imports_nothing_of_the_package():
+    tree = ast.parse(Path(independent.__file__).read_text("utf-8"))
+    outside = [node for node in tree.body if not (isinstance(node, ast.FunctionDef) and node.name == "main")]
+    names = {
+        name.split(".")[0]
+        for node in outside
+        for part in ast.walk(node)
+        if isinstance(part, (ast.Import, ast.ImportFrom))
+        for name in ([part.module] if isinstance(part, ast.ImportFrom) else [alias.name for alias in part.names])
+    }
+    assert names <= {
+        "__future__",
+        "json",
+        "math",
+        "tempfile",
+        "collections",
+        "dataclasses",
+        "pathlib",
+        "numpy",
+        "typing",
+        "tyro",
+    }
