@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counted
 from itertools import cycle, islice
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -34,7 +35,6 @@ from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RESOLUTION, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.metrics import MOST_PSNR, psnr_of
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views, spread_indices
@@ -156,14 +156,8 @@ def _scenes(
 @torch.no_grad()
 def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
-    psnrs = []
-    for index in indices:
-        view, photo, mask = every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device)
-        apart, counted = render(scene, view).double() - photo, 1.0
-        if mask is not None:
-            apart, counted = apart * mask, float(mask.double().mean())
-        psnrs.append(min(psnr_of(float(apart.square().mean()), counted), MOST_PSNR))
-    return sum(psnrs) / len(psnrs)
+    shown = (every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device) for index in indices)
+    return fmean(photo.psnr(render(scene, photo.view)) for photo in shown)
 
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:

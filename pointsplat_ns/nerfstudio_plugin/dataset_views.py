@@ -102,12 +102,12 @@ def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None
     return len(frames), any(frames.dataset._dataparser_outputs.mask_filenames or ())
 
 
-def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:
-    """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
+def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
+    """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, "train", data, photos=True)
-    _views_of(scene, frames, "train")
-    return TrainingPhotos(scene, frames)
+    scene, frames = _open(path, split, data, photos=True)
+    _views_of(scene, frames, split)
+    return RunPhotos(scene, frames)
 
 
 def need_named_data(scene: object, data: Path | str | None) -> None:
@@ -121,10 +121,10 @@ def need_named_data(scene: object, data: Path | str | None) -> None:
         raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
     trained, frames = _open(scene, "train", data)
     _views_of(trained, frames, "train")
-    check_photos(trained.read_dense(), TrainingPhotos(trained, frames), data)
+    check_photos(trained.read_dense(), RunPhotos(trained, frames), data)
 
 
-class TrainingPhotos(Sequence[Example]):
+class RunPhotos(Sequence[Example]):
     """Photos of a split, and the views on the CPU that they show once undistorted."""
 
     def __init__(self, scene: TrainedScene, frames: Frames):
