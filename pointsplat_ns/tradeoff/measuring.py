@@ -72,7 +72,7 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     note = ""
     if subject.held_out is not None:
         try:
-            views, photos, note = _judging(subject.held_out(), count)
+            views, photos, note = photos_of_one_size(subject.held_out(), count)
             whole = views if subject.resolution is None else views.resized(max(subject.resolution))
             middle = middle_sized(whole)
             small = views.resized(max(middle.width, middle.height))
@@ -85,7 +85,7 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     return JudgedViews(source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin), note
 
 
-def _judging(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
+def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
     """At most ``count`` photos of one size, their views, and a note on photos of other sizes."""
     shown = [photos[index] for index in spread_indices(len(photos), count)]
     if not shown:
