@@ -112,17 +112,17 @@ def read_posed_photos(
         return (4 if masked else 3) * math.prod(reader.size(files[index], named.cameras[index]))
 
     sizes = _usable(size, sorted(files if training else held), faults)
-    indices = [*sizes]
     try:
         require_memory(folder, sum(sizes.values()))
     except SceneError as error:
         raise DataError(f"{error}: lower --resolution") from error
     progress("finding the frame of the photos", 0.0)
-    few = [indices[place] for place in spread_indices(len(indices), POSE_CHECK.views)]
+    every = [index for index in sorted(files) if index not in faults]
+    few = [every[place] for place in spread_indices(len(every), POSE_CHECK.views)]
     shown = _usable(lambda index: _example(small, named, named.views, index, files[index]), few, faults)
     views = in_frame(dense, named, shown, model)
     examples = _usable(
-        lambda index: _example(reader, named, views, index, files[index]), indices, faults,
+        lambda index: _example(reader, named, views, index, files[index]), [*sizes], faults,
         lambda done: progress("reading photos", done),
     )  # fmt: skip
     psnrs = _outliers(dense, examples, progress)
@@ -139,7 +139,7 @@ def read_posed_photos(
     logger.info(
         "photos: %d of %s%s, poses of %s; %d are held out; %s in memory",
         len(examples), folder, ", undistorted" * bent + ", with masks" * masked, model, len({*good} & {*held}),
-        bytes_text(sum(_bytes_of(example) for example in examples.values())),
+        bytes_text(sum(sizes[index] for index in examples)),
     )  # fmt: skip
     apart = [examples[i] for i in good if i in held]
     return PosedPhotos(views.resized(side), [examples[i] for i in good if i not in held], apart, model)
@@ -238,10 +238,6 @@ def _example(reader: PhotoReader, named: NamedViews, views: Views, index: int, p
     height, width = photo.image.shape[:2]
     view = replace(views[index], K=photo.K.to(views.Ks), width=width, height=height)
     return Example(view, photo.image, photo.mask)
-
-
-def _bytes_of(example: Example) -> int:
-    return example.target.numel() + (0 if example.mask is None else example.mask.numel())
 
 
 def _outliers(dense: Gaussians, examples: Mapping[int, Example], progress: Progress) -> dict[int, float]:
