@@ -110,6 +110,7 @@ def prune(
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
     data: str | Path | None = None,
+    photos: bool | str | Path = False,
     progress: bool | Progress = False,
 ) -> Gaussians:
     """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
@@ -136,6 +137,7 @@ def prune(
             1920 x 1080.
         up: the axis that is up in the scene, "z" or "-y", for sampled views; by default the scene's own, or estimated.
         data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
+        photos: whether to log PSNR in a run's held-out photos; or a folder of photos, with poses in ``views``, or near.
         progress: True shows a bar; a function is called with the current task and the share of it that is done.
 
     Returns:
@@ -154,7 +156,7 @@ def prune(
         (1000, 0.1)
     """
     request = PruneRequest(keep, by, sh, opacity_weight, clean)
-    return prune_source(scene, request, Looking(views, resolution, up, data), progress)[1]
+    return prune_source(scene, request, Looking(views, resolution, up, data, photos), progress)[1]
 
 
 def compact(
@@ -197,8 +199,8 @@ def compact(
         effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200, up to four times as many for
             more than 20,000 Gaussians.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
-        photos: also train on the training photos of the run's dataset, by 1200 ("quick") or 12000 ("thorough") steps,
-            or for ``seconds``. Photos in and outside of the steps say whether the result is better.
+        photos: also train on photos, named as for :func:`prune`, by 1200 ("quick") or 12000 ("thorough") steps, or for
+            ``seconds``.
         target_db: least PSNR of the file against the given scene's renders, over the pixels that it covers, dB.
         target_ms: longest time of a frame, milliseconds, drawn by this package.
         target_mb: largest file, in units of 10^6 bytes.
@@ -228,7 +230,7 @@ def compact(
     format_to_write(target_format)
     request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
-    looking = Looking(views, resolution, up, data, None if isinstance(photos, bool) else Path(photos))
+    looking = Looking(views, resolution, up, data, photos)
     return compact_source(scene, request, targets, looking, progress)[1]
 
 

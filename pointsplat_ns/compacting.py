@@ -6,23 +6,22 @@ import logging
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from pointsplat_ns.compression.compacted import Compacted, last_kept
 from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
-from pointsplat_ns.compression.requests import CompactRequest, PruneRequest
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, default_device
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
+from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.photo_repair import Photos
-    from pointsplat_ns.compression.posed_photos import PosedPhotos
-    from pointsplat_ns.looking.view_source import ViewSource
     from pointsplat_ns.tradeoff.search import Targets
 
 logger = logging.getLogger("pointsplat_ns")
@@ -44,8 +43,9 @@ class Looking:
     up: str | None = None
     data: str | Path | None = None
     """Where the data of a run is now, if it moved: the data itself, or a folder above it."""
-    photos: Path | None = None
-    """Folder of photos to train on; ``views`` then names the file with their poses, or is None."""
+    photos: Path | str | bool = False
+    """Whether to read the photos of the scene's run; or a folder of photos, whose poses are those of ``views``, a file,
+    or are looked for if that is None."""
     size: tuple[int, int] | None = field(init=False)
     """``resolution``, parsed."""
     upward: Up | None = field(init=False)
@@ -72,12 +72,13 @@ def prune_source(
     """
     from pointsplat_ns.compression.prune import prune_scene
 
-    dense, source = read_source(scene, looking)
+    dense, source, photos = _read_photographed(scene, looking, progress, training=False)
     start = time.perf_counter()
     with progress_bar(progress) as report:
         pruned = prune_scene(dense, request, source, report)
         seconds = time.perf_counter() - start
     _log_details(pruned.notes, source)
+    _log_held_out(dense, (pruned.scene,), photos)
     return dense, pruned.scene, seconds, source
 
 
@@ -163,19 +164,12 @@ def compact_source(
     Returns:
         The dense scene, the result, and the source of its views, to judge it in.
     """
-    posed = None
-    if looking.photos is not None:
-        dense, source, posed = _read_with_photos(scene, looking, looking.photos, progress)
-    else:
-        dense, source = read_source(scene, looking)
+    dense, source, photos = _read_photographed(scene, looking, progress)
     with progress_bar(progress) as report:
         if targets is None:
             from pointsplat_ns.compression.compact import compact_scene
 
-            photos = None if posed is None else posed.training
-            if photos is None and request.photos is not None:
-                photos = _training_photos(dense, scene, looking.data)
-            result = compact_scene(dense, request, source, report, photos)
+            result = compact_scene(dense, request, source, report, photos.training)
         else:
             from pointsplat_ns.tradeoff.making import subject_of
             from pointsplat_ns.tradeoff.points import repairs_of
@@ -186,10 +180,8 @@ def compact_source(
             result = find_scene(subject, targets, request.prune.by, repairs_of(request.repair.effort), report)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
     log(tuple(result.target.splitlines()))
-    if posed is not None and posed.held_out:
-        from pointsplat_ns.compression.posed_photos import held_out_text
-
-        log((held_out_text(dense.to(request.device), result, posed.held_out),))
+    trained = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), None)
+    _log_held_out(dense, (last_kept(result.stages[:trained]).scene, result.scene), photos)
     return dense, result, source
 
 
@@ -217,37 +209,54 @@ def read_source(scene: Source, looking: Looking) -> tuple[Gaussians, ViewSource]
     return dense, view_source(dense, given, looking.run_of(scene), data, looking.size, looking.upward)
 
 
-def _read_with_photos(
-    scene: Source, looking: Looking, folder: Path, progress: bool | Progress
-) -> tuple[Gaussians, ViewSource, PosedPhotos]:
-    """The dense scene, its views, and the photos in a folder. Raises SceneError if the options on views do not fit, and
-    as :func:`~pointsplat_ns.compression.posed_photos.read_posed_photos`."""
-    from pointsplat_ns.compression.posed_photos import read_posed_photos
-    from pointsplat_ns.io.scene import read_scene
-    from pointsplat_ns.looking.view_source import ViewSource
+class _Photos(NamedTuple):
+    """Photos that are trained on and judge."""
 
-    if isinstance(looking.views, Views) or without_poses(looking.views):
-        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
-    if looking.data is not None:
-        raise SceneError(f"{looking.data}: the data of a run, but photos are read from {folder}; expected one of both")
-    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
-    with progress_bar(progress) as report:
-        posed = read_posed_photos(dense, folder, looking.views, path, looking.size, report)
-    return dense, ViewSource(dense, posed.views, resolution=looking.size, up=looking.upward), posed
+    training: Photos | None = None
+    held_out: Photos = ()
 
 
-def _training_photos(dense: Gaussians, scene: Source, data: str | Path | None) -> Photos:
-    """The training photos of a run's dataset, which renders of the dense scene are like. Raises SceneError if there is
-    no run, and DataError if its data is not found."""
+def _read_photographed(
+    scene: Source, looking: Looking, progress: bool | Progress, training: bool = True
+) -> tuple[Gaussians, ViewSource, _Photos]:
+    """The dense scene, its views and its photos; those to train on only with ``training``. Errors are those of
+    :func:`read_source`, and of :func:`~pointsplat_ns.compression.posed_photos.read_with_photos`; or a SceneError if the
+    photos of a run are wanted and there is no run, a DataError if its data is not found or unlike the scene."""
+    if looking.photos is False:
+        return *read_source(scene, looking), _Photos()
+    if not isinstance(looking.photos, bool):
+        from pointsplat_ns.compression.posed_photos import read_with_photos
+
+        with progress_bar(progress) as report:
+            dense, posed = read_with_photos(
+                scene, Path(looking.photos), looking.views, looking.data, looking.size, report, training
+            )
+        source = ViewSource(dense, posed.views, resolution=looking.size, up=looking.upward)
+        return dense, source, _Photos(posed.training, posed.held_out)
     if isinstance(scene, Gaussians):
         raise SceneError(
             "photos are read from the dataset of a run; expected the path of a run, or the folder of the photos"
         )
-    from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
+    from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 
-    photos = training_photos(scene, data)
+    dense, source = read_source(scene, looking)
+    photos = run_photos(scene, "train", looking.data)
     check_photos(dense, photos, str(scene))
-    return photos
+    try:
+        held_out = run_photos(scene, "test", looking.data)
+        shown = spread_indices(len(held_out), VIEW_COUNTS.compared)
+        return dense, source, _Photos(photos, [held_out[index] for index in shown])
+    except DataError as error:
+        log((f"there are no held-out photos: {error}",))
+        return dense, source, _Photos(photos)
+
+
+def _log_held_out(dense: Gaussians, results: tuple[Gaussians, ...], photos: _Photos) -> None:
+    """Log the PSNR of results in held-out photos, if there are any."""
+    if photos.held_out:
+        from pointsplat_ns.compression.posed_photos import held_out_text
+
+        log((held_out_text(dense.to(default_device()), results, photos.held_out),))
 
 
 def log(lines: tuple[str, ...]) -> None:

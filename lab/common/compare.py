@@ -11,10 +11,19 @@ from torch import Tensor
 from pointsplat_ns.io import open_run, scene_name
 from pointsplat_ns.metrics import finite_psnr, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
+from pointsplat_ns.tradeoff.measuring import photos_of_one_size
 from pointsplat_ns.views import Views
 
 METRICS = ("psnr", "ssim", "lpips")
+
+
+def dataset_photos(
+    path: Path | str, split: Literal["train", "test"], count: int, data: Path | str | None = None
+) -> tuple[Views, list[Tensor]]:
+    """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and their views on the CPU."""
+    views, photos, _ = photos_of_one_size(run_photos(path, split, data), count)
+    return views, [photo.target for photo in photos]
 
 
 def photos_of(path: Path, split: Literal["train", "test"], count: int) -> tuple[str, Views, list[Tensor]]:

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 import pointsplat_ns as ps
+from lab.common.compare import dataset_photos
 from lab.tables.ways import PROTOCOL
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_facts, dataset_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_facts
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.views import Views

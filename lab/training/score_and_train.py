@@ -18,7 +18,7 @@ from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.compression.photo_repair import photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PhotoBudget, PruneRequest
-from pointsplat_ns.nerfstudio_plugin.dataset_views import training_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def main(
     dense, views = read_source(run, Looking())
     pruned = prune_scene(dense, PruneRequest(keep, by), views).scene
     budget = CpuBudget(cpu_seconds=seconds, started=time.process_time())
-    trained = photo_repair(pruned, dense, training_photos(run), views, budget)
+    trained = photo_repair(pruned, dense, run_photos(run), views, budget)
     print(f"{trained.steps} steps: {trained.before:.2f} -> {trained.after:.2f} dB in {trained.compared} photos")
     ps.save(trained.scene, output, overwrite=True)
 

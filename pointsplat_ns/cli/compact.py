@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.folders import folder_command
@@ -28,25 +27,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.gaussians import Gaussians
 
 
-def _photos(words: list[str]) -> Path | bool:
-    if len(words) > 1 or words == [""]:
-        raise ValueError("expected a folder of photos, or nothing for those of a run")
-    return Path(words[0]) if words else True
-
-
-Photos = Annotated[
-    Path | bool,
-    PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="[FOLDER]",
-        instance_from_str=_photos,
-        is_instance=lambda value: isinstance(value, (bool, Path)),
-        str_from_instance=lambda value: [str(value)] if isinstance(value, Path) else [] if value else ["none"],
-    ),
-]
-"""Whether to train on the photos of a run, or the folder of other photos."""
-
-
 def compact(
     scene: options.Scenes,
     output: options.Output = None,
@@ -58,7 +38,7 @@ def compact(
     clean: bool = False,
     effort: Literal["instant", "quick", "thorough"] = "quick",
     seconds: float | None = None,
-    photos: Photos = False,
+    photos: options.Photos = False,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: options.Megabytes | None = None,
@@ -156,7 +136,7 @@ def compact(
         refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
     )
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
-    looking = Looking(poses, resolution, up, data, photos if isinstance(photos, Path) else None)
+    looking = Looking(poses, resolution, up, data, photos)
     with fixed_threads(threads):
         dense, result, source = compact_source(scene, request, targets, looking, progress=True)
     if not dry_run:

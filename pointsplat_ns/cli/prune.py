@@ -27,6 +27,7 @@ def prune(
     resolution: options.Resolution = None,
     up: options.Up = None,
     data: options.Data = None,
+    photos: options.Photos = False,
     plot: Path | None = None,
     dry_run: bool = False,
     force: options.Force = False,
@@ -56,6 +57,9 @@ def prune(
         opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
         sh: SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
+        photos: also print PSNR in held-out photos: of the dataset of a run, or every eighth photo, by name, in FOLDER.
+            Nothing is trained. Its poses, those of --poses or of a file of cameras there, above it or beside the scene,
+            are then the views.
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
@@ -80,7 +84,14 @@ def prune(
         from pointsplat_ns.folders import prune_folder
         from pointsplat_ns.scene_folder import output_folder
 
-        one = {"--poses": poses, "--up": up, "--plot": plot, "--dry-run": dry_run, "--memory": memory}
+        one = {
+            "--poses": poses,
+            "--up": up,
+            "--plot": plot,
+            "--dry-run": dry_run,
+            "--memory": memory,
+            "--photos": photos,
+        }
         return folder_command(
             prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
             request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data,
@@ -99,7 +110,7 @@ def prune(
     with fixed_threads(threads):
         if rows is None:
             options.need_no_jobs(scene, jobs)
-            looking = Looking(poses, resolution, up, data)
+            looking = Looking(poses, resolution, up, data, photos)
             dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
             small, before = pruned, len(dense)
             if not dry_run:
@@ -108,8 +119,8 @@ def prune(
                 quality = quality_of_file(dense, source, pruned, written, suffix)
                 if plot is not None:
                     ps.plot_distributions({"before": dense, "after": pruned}, plot)
-        elif dry_run or plot is not None:
-            raise ps.SceneError(f"{scene}: does not fit into memory; expected neither --dry-run nor --plot")
+        elif dry_run or plot is not None or photos is not False:
+            raise ps.SceneError(f"{scene}: does not fit into memory; expected no --dry-run, --plot or --photos")
         else:
             processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
             with progress_bar() as report:

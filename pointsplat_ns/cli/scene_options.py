@@ -230,6 +230,25 @@ def _share(text: str) -> float:
 Share = Annotated[float, _spec("SHARE", _share)]
 """A share of the Gaussians, such as 0.1 or 10%."""
 
+
+def _photos(words: list[str]) -> Path | bool:
+    if len(words) > 1 or words == [""]:
+        raise ValueError("expected a folder of photos, or nothing for those of a run")
+    return Path(words[0]) if words else True
+
+
+Photos = Annotated[
+    Path | bool,
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[FOLDER]",
+        instance_from_str=_photos,
+        is_instance=lambda value: isinstance(value, (bool, Path)),
+        str_from_instance=lambda value: [str(value)] if isinstance(value, Path) else [] if value else ["none"],
+    ),
+]
+"""Whether to use the photos of a run, or the folder of other photos."""
+
 Megabytes = Annotated[float, _spec("MB", parse_megabytes)]
 """A size, in units of 10^6 bytes: 12, 12MB, 800kB or 1GB."""
 

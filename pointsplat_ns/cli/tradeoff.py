@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
@@ -27,6 +28,7 @@ def tradeoff(
     resolution: options.Resolution = None,
     up: options.Up = None,
     data: options.Data = None,
+    photos: Path | None = None,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: options.Megabytes | None = None,
@@ -50,6 +52,8 @@ def tradeoff(
         sh: SH degrees to measure: all bands, or those up to a degree.
         repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
+        photos: folder of photos to judge by, where the scene is no run: every eighth, by name. --poses names the file
+            with their poses, or one is looked for.
         target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
             there is no search.
         target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
@@ -68,8 +72,8 @@ def tradeoff(
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
             scene, folder, keep=keep, within=within, by=by, sh=sh, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, up=up, data=data, target_db=target_db, target_ms=target_ms, target_mb=target_mb,
-            force=force, progress=True,
+            resolution=resolution, up=up, data=data, photos=photos, target_db=target_db, target_ms=target_ms,
+            target_mb=target_mb, force=force, progress=True,
         )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})

@@ -8,10 +8,10 @@ import math
 import time
 from typing import Literal
 
-from pointsplat_ns.compression.acceptance import Comparison, Reason, accept_change
+from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason, accept_change
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
-from pointsplat_ns.compression.photo_repair import Photos, photo_repair
+from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, Photos, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
 from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
@@ -122,7 +122,8 @@ def _trained(
     progress("training on photos", 0.0)
     report = functools.partial(progress, "training on photos")
     trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = None if trained.after > trained.before else Reason.NO_GAIN
+    reason = None if trained.lost <= PHOTO_REPAIR.most_lost else Reason.NO_GAIN
+    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else Reason.SMALL_GAIN  # NaN too
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
     return Stage("photos", scene, after, last.after, 1.0, reason, *figures, photos=trained)

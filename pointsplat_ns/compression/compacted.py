@@ -164,7 +164,7 @@ def last_kept(stages: Sequence[Stage]) -> Stage:
 
 def _line(stage: Stage, result: Compacted) -> str:
     if stage.photos is not None:
-        return _photo_line(stage.photos, kept=stage.accepted)
+        return _photo_line(stage, stage.photos)
     if stage.name == "round":
         figures = "" if stage.before is None or stage.after is None else f": {_figures(stage.before, stage.after)}"
         return f"rounded for the size of the file{figures}"
@@ -184,7 +184,7 @@ def _line(stage: Stage, result: Compacted) -> str:
         return f"{done}{cost}{share}: {figures}"
     reasons = {
         Reason.NO_GAIN: "it does not help",
-        Reason.SMALL_GAIN: f"it brings less than {ACCEPTANCE.min_gain:g} dB",
+        Reason.SMALL_GAIN: f"it {_TOO_LITTLE}",
         Reason.MOST_VIEWS: "it is farther in most views",
         Reason.OTHER_SIZES: "it harms pictures of another size",
     }
@@ -193,11 +193,17 @@ def _line(stage: Stage, result: Compacted) -> str:
     return f"not {done}{cost}, {reasons[stage.reason]}: {figures}"
 
 
-def _photo_line(trained: PhotoRepaired, kept: bool) -> str:
+_TOO_LITTLE = f"brings less than {ACCEPTANCE.min_gain:g} dB"
+
+
+def _photo_line(stage: Stage, trained: PhotoRepaired) -> str:
     cost = f"on {trained.used} photos by {trained.steps} steps in {trained.seconds:.1f} s"
     cost += ", interrupted" if trained.interrupted else ""
     gain = f"{trained.before:.1f} -> {trained.after:.1f} dB PSNR in {trained.compared} photos"
-    return f"trained {cost}: {gain}" if kept else f"not trained {cost}, it does not help: {gain}"
+    if stage.accepted:
+        return f"trained {cost}: {gain}"
+    why = f"other photos lose {trained.lost:.1f} dB" if stage.reason is Reason.NO_GAIN else f"it {_TOO_LITTLE}"
+    return f"not trained {cost}, {why}: {gain}"
 
 
 def _uncompared(result: Compacted) -> str:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import SSIM_WINDOW
+from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, psnr_of
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import one_thread, suitable_threads
@@ -117,6 +117,17 @@ class Example(NamedTuple):
     target: Tensor  # [H, W, 3] in [0, 1]
     mask: Tensor | None = None  # [H, W, 1] bool, the pixels that count; None for all
 
+    def compared(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """An image of the view and the target on its device, both black where pixels do not count."""
+        target = self.target.to(image)
+        return (image, target) if self.mask is None else (image * self.mask.to(image), target * self.mask.to(image))
+
+    def psnr(self, image: Tensor) -> float:
+        """PSNR of an image of the view, over the pixels that count, dB; at most ``MOST_PSNR``."""
+        image, target = self.compared(image.double())
+        counted = 1.0 if self.mask is None else float(self.mask.double().mean())
+        return min(psnr_of(float((image - target).square().mean()), counted), MOST_PSNR)
+
 
 def optimised(
     scene: Gaussians,
@@ -187,7 +198,7 @@ def gradients_of(
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
         image = render(leaves, view, backend=backend)
-        _loss(*((image, target) if mask is None else (image * mask, target * mask))).backward()
+        _loss(*Example(view, target, mask).compared(image)).backward()
     return {name: _finite_gradient(value) for name, value in leaves.items()}
 
 

@@ -8,16 +8,17 @@ nerfstudio do.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
-from pointsplat_ns.compression.compacted import Compacted, last_kept
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos, mean_psnr
+from pointsplat_ns.compression.posed_scene import without_poses
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.lenses import lens_of
@@ -25,15 +26,19 @@ from pointsplat_ns.io.camera_files import NamedViews, camera_files_near, read_na
 from pointsplat_ns.io.camera_files.colmap import model_folder
 from pointsplat_ns.io.files import bytes_text, logger, require_memory
 from pointsplat_ns.io.photos import PhotoReader, photo_files, photos_of_cameras
+from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.content import thinned
 from pointsplat_ns.looking.photo_frame import in_frame
 from pointsplat_ns.looking.pose_check import POSE_CHECK, likeness
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
 
 LEAST_PHOTOS = 8
 """Fewer hold none out."""
+
+_Read = TypeVar("_Read")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +49,27 @@ class PosedPhotos:
     """The views of all cameras of the file."""
     training: Photos
     held_out: Photos
+    poses: Path
+    """The file of cameras."""
+
+
+def read_with_photos(
+    scene: Gaussians | Path | str,
+    folder: Path,
+    poses: object = None,
+    data: object = None,
+    resolution: tuple[int, int] | None = None,
+    progress: Progress = silent,
+    training: bool = True,
+) -> tuple[Gaussians, PosedPhotos]:
+    """Read a scene, and the photos in a folder; arguments as of :func:`read_posed_photos`. Raises SceneError if
+    ``poses`` is no path or None, or the ``data`` of a run is named besides."""
+    if not (poses is None or isinstance(poses, (str, Path))) or without_poses(poses):
+        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
+    if data is not None:
+        raise SceneError(f"{data}: the data of a run, but photos are read from {folder}; expected one of both")
+    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
+    return dense, read_posed_photos(dense, folder, poses, path, resolution, progress, training)
 
 
 def read_posed_photos(
@@ -53,8 +79,10 @@ def read_posed_photos(
     scene: Path | None = None,
     resolution: tuple[int, int] | None = None,
     progress: Progress = silent,
+    training: bool = True,
 ) -> PosedPhotos:
-    """Read the photos in a folder, reduced to the resolution; they stay in memory, a byte a channel.
+    """Read the photos in a folder, reduced to the resolution; they stay in memory, a byte a channel. Photos that cannot
+    be used are named and left out.
 
     Args:
         dense: N Gaussians.
@@ -63,55 +91,99 @@ def read_posed_photos(
         scene: file of the scene, beside which cameras and ``dataparser_transforms.json`` are looked for.
         resolution: width and height, pixels; the longer side bounds that of photos. By default 1600.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        training: whether to read the photos that are not held out.
 
     Raises:
         DataError: if there are no photos or poses, too few of them belong together, or renders of the scene are not
-            like the photos in any frame that was tried; if a photo cannot be read, or they take more memory than is
-            free.
+            like the photos in any frame that was tried; if most photos cannot be used, or they take more memory than
+            is free.
     """
     folder = Path(folder)
     model, named, files = _posed_files(folder, poses, scene)
+    order = sorted(files, key=lambda index: named.names[index])
+    held = order[::8]
     side = 1600 if resolution is None else max(resolution)  # as in 3DGS training
+    faults: dict[int, DataError] = {}
     masks = model if model.is_dir() else model.parent
-    indices = sorted(files)
-    few = [indices[place] for place in spread_indices(len(indices), POSE_CHECK.views)]
-    reader = PhotoReader(masks, POSE_CHECK.side)
-    shown = {index: _example(reader, named, named.views, index, files[index]) for index in few}
-    progress("finding the frame of the photos", 0.0)
-    views = in_frame(dense, named, shown, model)
-    reader = PhotoReader(masks, side)
-    taken = sum(math.prod(reader.size(files[index], named.cameras[index])) for index in indices)
+    reader, small = PhotoReader(masks, side, folder), PhotoReader(masks, POSE_CHECK.side, folder)
+
+    def size(index: int) -> int:
+        masked = reader.mask_of(files[index], named.cameras[index]) is not None
+        return (4 if masked else 3) * math.prod(reader.size(files[index], named.cameras[index]))
+
+    sizes = _usable(size, sorted(files if training else held), faults)
     try:
-        require_memory(folder, taken * (4 if any(named.cameras[index].mask for index in indices) else 3))
+        require_memory(folder, sum(sizes.values()))
     except SceneError as error:
         raise DataError(f"{error}: lower --resolution") from error
-    examples = _read_all(reader, named, views, files, progress)
-    left_out = _outliers(dense, examples, progress)
-    if left_out:
-        worst = ", ".join(f"{files[index].name} ({psnr:.1f} dB)" for index, psnr in list(left_out.items())[:6])
-        more = f" and {len(left_out) - 6} more" if len(left_out) > 6 else ""
-        logger.info("photos that fit worst are left out: %s%s", worst, more)
-    names = sorted(indices, key=lambda index: named.names[index])
-    held = [index for index in names[::8] if index not in left_out]
-    training = [index for index in names if index not in held and index not in left_out]
-    bent = any(lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in indices)
-    logger.info(
-        "photos: %d of %s" + (", undistorted" if bent else "") + ", poses of %s; %d are held out; %s in memory",
-        len(examples), folder, model, len(held), bytes_text(sum(_bytes_of(examples[i]) for i in examples)),
+    progress("finding the frame of the photos", 0.0)
+    every = [index for index in sorted(files) if index not in faults]
+    few = [every[place] for place in spread_indices(len(every), POSE_CHECK.views)]
+    shown = _usable(lambda index: _example(small, named, named.views, index, files[index]), few, faults)
+    views = in_frame(dense, named, shown, model)
+    examples = _usable(
+        lambda index: _example(reader, named, views, index, files[index]), [*sizes], faults,
+        lambda done: progress("reading photos", done),
     )  # fmt: skip
-    return PosedPhotos(views.resized(side), [examples[i] for i in training], [examples[i] for i in held])
+    psnrs = _outliers(dense, examples, progress)
+    for why, lines in (
+        ("cannot be used", [str(error) for error in faults.values()]),
+        ("fit worst", [f"{files[index].name} ({psnr:.1f} dB)" for index, psnr in psnrs.items()]),
+    ):
+        if lines:
+            more = f" and {len(lines) - 6} more" if len(lines) > 6 else ""
+            logger.info("photos that %s are left out: %s%s", why, ", ".join(lines[:6]), more)
+    good = [index for index in order if index in examples and index not in psnrs]
+    bent = any(lens_of(named.cameras[index].model, named.cameras[index].distortion) for index in examples)
+    masked = any(reader.mask_of(files[index], named.cameras[index]) for index in examples)
+    logger.info(
+        "photos: %d of %s%s, poses of %s; %d are held out; %s in memory",
+        len(examples), folder, ", undistorted" * bent + ", with masks" * masked, model, len({*good} & {*held}),
+        bytes_text(sum(sizes[index] for index in examples)),
+    )  # fmt: skip
+    apart = [examples[i] for i in good if i in held]
+    return PosedPhotos(views.resized(side), [examples[i] for i in good if i not in held], apart, model)
 
 
-def held_out_text(dense: Gaussians, result: Compacted, photos: Photos) -> str:
-    """Text on what training on photos did in held-out ones, at most twelve of them; ``dense`` is on the device that
-    renders."""
-    shown = spread_indices(len(photos), 12)
-    at = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), len(result.stages))
-    scenes = (last_kept(result.stages[:at]).scene, result.scene, dense)
-    before, after, best = (mean_psnr(scene.to(dense.device), photos, shown) for scene in scenes)
-    return (
-        f"held-out photos: {before:.1f} -> {after:.1f} dB PSNR in {len(shown)} photos, of the dense scene {best:.1f} dB"
-    )
+def held_out_text(dense: Gaussians, results: Sequence[Gaussians], photos: Photos) -> str:
+    """Text on the PSNR of results in held-out photos, one after the other, and of the dense scene, which is on the
+    device that renders."""
+    shown = spread_indices(len(photos), VIEW_COUNTS.compared)
+    *psnrs, best = (mean_psnr(scene.to(dense.device), photos, shown) for scene in (*results, dense))
+    figures = " -> ".join(f"{psnr:.1f}" for psnr in psnrs)
+    return f"held-out photos: {figures} dB PSNR in {len(shown)} photos, of the dense scene {best:.1f} dB"
+
+
+def _usable(
+    read: Callable[[int], _Read],
+    indices: Sequence[int],
+    faults: dict[int, DataError],
+    progress: Callable[[float], None] = lambda done: None,
+) -> dict[int, _Read]:
+    """What is read for each index, by two threads, and in ``faults`` the errors of the others. Raises the first error
+    if most have one."""
+
+    def attempt(index: int) -> _Read | DataError:
+        try:
+            return read(index)
+        except DataError as error:
+            return error
+
+    found: dict[int, _Read] = {}
+    with ThreadPoolExecutor(2, thread_name_prefix="photos") as pool:
+        try:
+            for done, (index, result) in enumerate(zip(indices, pool.map(attempt, indices), strict=True)):
+                if isinstance(result, DataError):
+                    faults[index] = result
+                else:
+                    found[index] = result
+                progress((done + 1) / len(indices))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    if 2 * len(found) < len(indices):
+        raise next(iter(faults.values()))
+    return found
 
 
 def _posed_files(
@@ -168,28 +240,7 @@ def _example(reader: PhotoReader, named: NamedViews, views: Views, index: int, p
     return Example(view, photo.image, photo.mask)
 
 
-def _read_all(
-    reader: PhotoReader, named: NamedViews, views: Views, files: dict[int, Path], progress: Progress
-) -> dict[int, Example]:
-    """The photos by the indices of their views; two threads decode."""
-    examples: dict[int, Example] = {}
-    with ThreadPoolExecutor(2, thread_name_prefix="photos") as pool:
-        reading = pool.map(lambda index: _example(reader, named, views, index, files[index]), sorted(files))
-        try:
-            for index, example in zip(sorted(files), reading, strict=True):
-                examples[index] = example
-                progress("reading photos", len(examples) / len(files))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return examples
-
-
-def _bytes_of(example: Example) -> int:
-    return example.target.numel() + (0 if example.mask is None else example.mask.numel())
-
-
-def _outliers(dense: Gaussians, examples: dict[int, Example], progress: Progress) -> dict[int, float]:
+def _outliers(dense: Gaussians, examples: Mapping[int, Example], progress: Progress) -> dict[int, float]:
     """PSNR of the photos that fit much worse than the others, worst first: by 6 dB and by four standard deviations,
     estimated from the median deviation. Of seven captures, two photos of one are among them."""
     drawn = thinned(dense, POSE_CHECK.max_count)

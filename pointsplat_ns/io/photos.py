@@ -101,12 +101,14 @@ class PhotoReader:
     count. What is computed for a lens is kept: a capture has few.
 
     Args:
-        masks: the folder in which, or below which, masks lie.
+        masks: the folder in which, or below which, the masks lie that cameras name.
         side: longer side of the pictures, pixels; smaller photos stay as they are.
+        folder: of the photos. Where cameras name no mask, that of ``a.jpg`` is ``a.jpg.png``, as COLMAP names it, or
+            ``a.png`` in the folder ``masks`` beside it.
     """
 
-    def __init__(self, masks: Path, side: int):
-        self._masks, self._side = masks, side
+    def __init__(self, masks: Path, side: int, folder: Path | None = None):
+        self._masks, self._side, self._folder = masks, side, folder
         self._maps: dict[tuple, tuple[Tensor, Tensor]] = {}
 
     def size(self, path: Path, camera: Camera) -> tuple[int, int]:
@@ -131,7 +133,7 @@ class PhotoReader:
         image = torch.from_numpy(picture)
         if image.shape[2] == 4:
             image = (image[..., :3].int() * image[..., 3:].int() // 255).to(torch.uint8)
-        mask = self._mask(camera, size)
+        mask = self._mask(path, camera, size)
         K = torch.eye(3, **DOUBLES)
         for axis in range(2):
             stretch = size[axis] / camera.size[axis]
@@ -175,16 +177,28 @@ class PhotoReader:
         factor = min(1.0, self._side / max(width, height))
         return (max(1, round(width * factor)), max(1, round(height * factor))), turned
 
-    def _mask(self, camera: Camera, size: tuple[int, int]) -> Tensor | None:
-        """The mask that a file of cameras names, (H, W, 1) bool. White pixels count."""
+    def mask_of(self, path: Path, camera: Camera) -> Path | None:
+        """The file of the mask of a photo; None if all its pixels count. Raises DataError if the mask that its camera
+        names is not there."""
+        relative = PurePosixPath(camera.mask if "\0" not in camera.mask else "")
+        if relative.name:
+            mask = self._masks / relative
+            if relative.is_absolute() or ".." in relative.parts or not mask.is_file():  # nothing outside is opened
+                raise DataError(f"{mask}: no such mask, but the cameras name it; put it there, or take its name away")
+            return mask
+        if self._folder is None:
+            return None
+        own = self._folder.absolute().parent / "masks" / path.relative_to(self._folder)
+        names = (own.with_name(f"{own.name}.png"), own.with_suffix(".png"))
+        return next((name for name in names if name.is_file()), None)
+
+    def _mask(self, photo: Path, camera: Camera, size: tuple[int, int]) -> Tensor | None:
+        """The mask of a photo, (H, W, 1) bool. White pixels count."""
         from PIL import Image
 
-        relative = PurePosixPath(camera.mask if "\0" not in camera.mask else "")
-        if not relative.name:
+        path = self.mask_of(photo, camera)
+        if path is None:
             return None
-        path = self._masks / relative
-        if relative.is_absolute() or ".." in relative.parts or not path.is_file():  # nothing outside is opened
-            raise DataError(f"{path}: no such mask, but the cameras name it; put it there, or take its name away")
         try:
             with Image.open(path) as opened:
                 if opened.width * opened.height > MOST_PIXELS:

@@ -8,21 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
-
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.posed_scene import check_photos
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
-from pointsplat_ns.views import Views, spread_indices
+from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.frames import Frames
@@ -72,29 +67,6 @@ def view_source(
     return ViewSource(scene, given, run, functools.partial(dataset_views, data=data), resolution, up)
 
 
-def dataset_photos(
-    path: Path | str, split: Split, count: int, data: Path | str | None = None
-) -> tuple[Views, list[Tensor]]:
-    """At most ``count`` photos (H, W, 3) in [0, 1] of a run's dataset, evenly spread, and the views on the CPU that
-    they show once undistorted. Arguments and errors are those of :func:`dataset_views`; a photo that cannot be used is
-    a DataError."""
-    scene, frames = _open(path, split, data, photos=True)
-    poses = _views_of(scene, frames, split)
-    shown = [frames[index] for index in spread_indices(len(frames), count)]
-    photos = [in_unit_range(content["image"][..., :3]).float() for _, content in shown]
-    height, width = photos[0].shape[:2]
-    if any(photo.shape[:2] != (height, width) for photo in photos):
-        raise DataError(f"{scene.run.data}: photos of the {split} split have several sizes; expected one")
-    views = dataclasses.replace(
-        poses,
-        viewmats=torch.cat([viewmats_from_opengl(camera.camera_to_worlds) for camera, _ in shown]),
-        Ks=torch.cat([camera.get_intrinsics_matrices() for camera, _ in shown]),
-        width=width,
-        height=height,
-    )
-    return views, photos
-
-
 def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None) -> tuple[int, bool]:
     """Number of photos of a split, and whether they have masks. Arguments and errors are those of
     :func:`dataset_views`."""
@@ -102,12 +74,12 @@ def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None
     return len(frames), any(frames.dataset._dataparser_outputs.mask_filenames or ())
 
 
-def training_photos(path: Path | str, data: Path | str | None = None) -> Photos:
-    """The training photos of a run's dataset, read when they are asked for. Arguments and errors are those of
+def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
+    """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, "train", data, photos=True)
-    _views_of(scene, frames, "train")
-    return TrainingPhotos(scene, frames)
+    scene, frames = _open(path, split, data, photos=True)
+    _views_of(scene, frames, split)
+    return RunPhotos(scene, frames)
 
 
 def need_named_data(scene: object, data: Path | str | None) -> None:
@@ -121,10 +93,10 @@ def need_named_data(scene: object, data: Path | str | None) -> None:
         raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
     trained, frames = _open(scene, "train", data)
     _views_of(trained, frames, "train")
-    check_photos(trained.read_dense(), TrainingPhotos(trained, frames), data)
+    check_photos(trained.read_dense(), RunPhotos(trained, frames), data)
 
 
-class TrainingPhotos(Sequence[Example]):
+class RunPhotos(Sequence[Example]):
     """Photos of a split, and the views on the CPU that they show once undistorted."""
 
     def __init__(self, scene: TrainedScene, frames: Frames):

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.compacted import Compacted
 from pointsplat_ns.compression.photo_repair import Photos
+from pointsplat_ns.compression.posed_photos import read_with_photos
 from pointsplat_ns.compression.posed_scene import NO_POSES, read_found, without_poses
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
@@ -27,15 +26,12 @@ from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, view_source
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos, view_source
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.system.memory import PeakMemory
-from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, REPAIRS, Repair, Setting
 from pointsplat_ns.views import Views
-
-HeldOut = Callable[[int], tuple[Views, list[Tensor]]]
-"""From a number to at most that many views of held-out photos, and the photos (H, W, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +45,8 @@ class Subject:
     """Name of the scene in files of commands."""
     new_views: Callable[[], ViewSource]
     """Makes a new source of its views, the same as for its commands."""
-    held_out: HeldOut | None = None
-    """Its held-out photos; None if it cannot have any."""
+    held_out: Callable[[], Photos] | None = None
+    """Reads its held-out photos; None if it cannot have any."""
     refiner: TrainedRefiner | None = None
     """The refiner before repairs. None is no refiner, but the shipped one for the repair ``refiner``."""
     suffix: str = ".ply"
@@ -61,6 +57,8 @@ class Subject:
     """Width and height of pictures in pixels, if given; ``new_views`` has them too."""
     training: Photos | None = None
     """Its training photos, for the repair ``photos``."""
+    photos: Path | None = None
+    """Folder of its photos, if they are not those of its run."""
 
     def names(self, setting: Setting) -> dict[str, Any]:
         """The key, the label and the command of a setting's point. The command has the count, because percentages are
@@ -81,6 +79,7 @@ class Subject:
         words += ["--refiner", SHIPPED] if setting.repair == "refiner" else []
         words += ["--effort", EFFORTS[setting.repair]] if repaired else []
         words += ["--photos"] if setting.repair == "photos" else []
+        words += [str(self.photos)] if setting.repair == "photos" and self.photos is not None else []
         key = "_".join(keys)
         command = shlex.join([*words, "-o", f"{self.name}_{key}.ply"])
         return {"key": key, "label": ", ".join(labels), "command": command}
@@ -110,7 +109,7 @@ def subject_of(
     """
     held_out = None
     if run is not None and views is None and may_be_run(run):
-        held_out = functools.partial(dataset_photos, run, "test", data=data)
+        held_out = functools.partial(run_photos, run, "test", data)
     return Subject(
         dense, run or Path("scene.ply"), "scene", lambda: view_source(dense, views, run, data, resolution, up),
         held_out, refiner, suffix, resolution=resolution,
@@ -123,11 +122,22 @@ def subject_at(
     resolution: tuple[int, int] | str | None,
     up: str | None,
     data: str | Path | None,
+    photos: Path | None = None,
+    progress: Progress = silent,
+    training: bool = True,
 ) -> Subject:
-    """The scene at a path, with the options on views that its commands repeat."""
+    """The scene at a path, with the options on views that its commands repeat; ``photos`` is a folder of photos, whose
+    errors are those of :func:`~pointsplat_ns.compression.posed_photos.read_with_photos`. With ``training``, these are
+    also trained on."""
     size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
-    dense, given, file = read_found(path, poses)
-    subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
+    if photos is None:
+        dense, given, file = read_found(path, poses)
+        subject = subject_of(dense, None if sampled else path, given, resolution=size, up=upward, data=data)
+    else:
+        dense, posed = read_with_photos(path, photos, poses, data, size, progress, training)
+        file = posed.poses
+        subject = subject_of(dense, None, posed.views, resolution=size, up=upward)
+        subject = replace(subject, held_out=lambda: posed.held_out, training=posed.training, photos=photos)
     named = {
         "--poses": NO_POSES if sampled else file,
         "--resolution": None if size is None else size_text(size),

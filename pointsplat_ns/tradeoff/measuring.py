@@ -23,14 +23,17 @@ from torch import Tensor
 
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compact import rounding_stage
+from pointsplat_ns.compression.optimiser import Example
+from pointsplat_ns.compression.photo_repair import Photos
 from pointsplat_ns.compression.quality import Judge, through_file
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, finite_psnr, ssim
+from pointsplat_ns.metrics import SSIM_WINDOW, ImageError, ssim
 from pointsplat_ns.metrics.lpips import Lpips, LpipsUnavailable, load_lpips
 from pointsplat_ns.pruning import cut_sh, need_usable
 from pointsplat_ns.rasterizer import render
@@ -39,7 +42,7 @@ from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.tradeoff.making import MadeScene, Subject, make
 from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting
-from pointsplat_ns.views import View, Views
+from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3
 """Number of timed frames of each view, alternating between the dense scene and the measured scene."""
@@ -49,7 +52,8 @@ class JudgedViews(NamedTuple):
     """The views that scenes are drawn and timed in, and compared with photos."""
 
     views: Views
-    photos: list[Tensor] | None  # [H, W, 3] in [0, 1], the photo of each view; None where there are none
+    photos: list[Example] | None
+    """The photo of each view, of its size, in [0, 1]; None where there are none."""
     origin: str
     """Text on the origin of the views."""
 
@@ -61,22 +65,43 @@ def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
     note = ""
     if subject.held_out is not None:
         try:
-            views, photos = subject.held_out(count)
+            views, photos, note = photos_of_one_size(subject.held_out(), count)
             whole = views if subject.resolution is None else views.resized(max(subject.resolution))
             middle = middle_sized(whole)
             small = views.resized(max(middle.width, middle.height))
             if small is not views:
-                photos = [_averaged(photo, small.height, small.width) for photo in photos]
-            return JudgedViews(small, photos, "held-out photos of the dataset"), ""
+                photos = [_averaged(photo, view) for photo, view in zip(photos, small, strict=True)]
+            return JudgedViews(small, photos, f"held-out photos of {subject.photos or 'the dataset'}"), note
         except (SceneError, DataError) as error:
             note = f"there are no held-out photos: {error}"
     source = subject.new_views()
     return JudgedViews(source.compared().spread(min(count, VIEW_COUNTS.compared)), None, source.origin), note
 
 
-def _averaged(photo: Tensor, height: int, width: int) -> Tensor:
-    small = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], (height, width), mode="area")
-    return small[0].permute(1, 2, 0)
+def photos_of_one_size(photos: Photos, count: int) -> tuple[Views, list[Example], str]:
+    """At most ``count`` photos of one size, their views, and a note on photos of other sizes."""
+    shown = [photos[index] for index in spread_indices(len(photos), count)]
+    if not shown:
+        raise DataError("no photo is held out")
+    sizes = [example.target.shape for example in shown]
+    size = max(sizes, key=sizes.count)
+    of_size = [example for example in shown if example.target.shape == size]
+    first = of_size[0].view
+    viewmats, Ks = (torch.stack(mats) for mats in zip(*((s.view.viewmat, s.view.K) for s in of_size), strict=True))
+    views = Views(viewmats, Ks, first.width, first.height, first.background, first.rasterize_mode)
+    others = len(shown) - len(of_size)
+    note = f"{others} of {len(shown)} held-out photos are of another size and left out" if others else ""
+    return views, [example._replace(target=in_unit_range(example.target).float()) for example in of_size], note
+
+
+def _averaged(photo: Example, view: View) -> Example:
+    """A photo reduced to a view, by the mean of each area; a pixel counts if half of its area does."""
+
+    def reduced(image: Tensor) -> Tensor:
+        planes = image.permute(2, 0, 1)[None].float()
+        return torch.nn.functional.interpolate(planes, (view.height, view.width), mode="area")[0].permute(1, 2, 0)
+
+    return Example(view, reduced(photo.target), None if photo.mask is None else reduced(photo.mask) >= 0.5)
 
 
 class Measurer:
@@ -189,8 +214,9 @@ class Measurer:
             images.append(render(scene, view))
             progress((1 + len(images)) / (1 + len(drawn)))
         if photos is not None:
-            pairs = [(image, photo.to(image)) for image, photo in zip(images, photos, strict=True)]
-            psnr, similarity = (fmean(float(metric(*pair)) for pair in pairs) for metric in (finite_psnr, ssim))
+            psnr = fmean(photo.psnr(image) for image, photo in zip(images, photos, strict=True))
+            pairs = [photo.compared(image) for image, photo in zip(images, photos, strict=True)]
+            similarity = fmean(float(ssim(*pair)) for pair in pairs)
             against_photos = ImageMetrics(psnr, similarity, self._perceived(pairs))
         perceived = None if self.lpips is None else self._perceived(zip(images, self.renders, strict=True))
         assert quality.ssim is not None

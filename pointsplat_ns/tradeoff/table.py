@@ -20,7 +20,7 @@ from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.scene import save, source_file
 from pointsplat_ns.looking.sizes import size_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, training_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, run_photos
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.rasterizer import render
@@ -70,6 +70,7 @@ def measure_tradeoff(
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
     data: str | Path | None = None,
+    photos: str | Path | None = None,
     target_db: float | None = None,
     target_ms: float | None = None,
     target_mb: float | None = None,
@@ -91,14 +92,15 @@ def measure_tradeoff(
         by: methods, as for :func:`pointsplat_ns.prune`; a search uses the first one.
         sh: SH degrees: "all" for all bands, a digit for those up to a degree.
         repairs: some of "none", "refiner", "quick" and "thorough", the efforts of :func:`pointsplat_ns.compact`, and
-            "photos", its training on the photos of a run.
+            "photos", its training on the photos.
         views: largest number of views that are timed, and of photos; without photos at most 12.
-        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then.
+        poses: a file of cameras to look from, as ``views`` of :func:`pointsplat_ns.prune`; no photos are used then,
+            unless they are named.
         resolution: as for :func:`pointsplat_ns.prune`. Scenes are judged in pictures of this size, as by every
             command. Frames are timed, and pictures drawn, at a middle size, of 784 x 441 pixels for 1920 x 1080; photos
             are reduced to it.
         up: as for :func:`pointsplat_ns.prune`.
-        data: as for :func:`pointsplat_ns.prune`.
+        data, photos: as for :func:`pointsplat_ns.prune`; the photos of a run are used anyway.
         target_db: least PSNR against the dense scene's renders, over the pixels that it covers, dB.
         target_ms: longest time of a frame, milliseconds.
         target_mb: largest file, in units of 10^6 bytes.
@@ -133,9 +135,10 @@ def measure_tradeoff(
     with claimed_folder(folder), progress_bar(progress) as report:
         if not force:
             check_folder(folder)
-        subject = subject_at(path, poses, resolution, up, data)
-        if "photos" in tried:
-            training = training_photos(path, data)
+        own, trained = None if photos is None else Path(photos), "photos" in tried
+        subject = subject_at(path, poses, resolution, up, data, own, report, trained)
+        if trained and own is None:
+            training = run_photos(path, "train", data)
             check_photos(subject.dense, training, path)
             subject = replace(subject, training=training)
         sweep = Sweep(subject, source_file(path).sha256, folder, report, within, views, force)
@@ -312,7 +315,7 @@ class Sweep:
         for path, photo, index in zip(self._pictures(point.key), self._pictures("photo"), self._pictured, strict=True):
             write_picture(render(scene.detach(), judged.views[index]), path)
             if judged.photos is not None and setting == self.dense:
-                write_picture(judged.photos[index], photo)
+                write_picture(judged.photos[index].target, photo)
         if self._frame is not None:
             keep_scene(self._frame, scene, point, self.folder)
         self.points[setting] = point

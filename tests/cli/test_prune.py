@@ -227,7 +227,7 @@ def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypa
         (("--memory", "1kB"), "is too small; expected at least"),
         (("--memory", "200kB", "--by", "opacity"), r"with --by opacity; expected more memory"),
         (("--memory", "200kB", "--clean", "--keep", "auto:30"), "with --clean, --keep auto:30"),
-        (("--memory", "200kB", "--dry-run"), "neither --dry-run nor --plot"),
+        (("--memory", "200kB", "--dry-run"), "expected no --dry-run, --plot or --photos"),
     ],
 )
 def test_what_needs_the_whole_scene_is_refused_under_a_limit_of_memory(options, named, tmp_path, capsys, monkeypatch):

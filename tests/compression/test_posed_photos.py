@@ -37,6 +37,11 @@ def views() -> ps.Views:
     return views_from_within((0.2, 0.1, 0.0), COUNT, 64, 48)
 
 
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
+
+
 @pytest.fixture()
 def said(caplog) -> pytest.LogCaptureFixture:
     caplog.set_level(logging.INFO, logger="pointsplat_ns")
@@ -160,6 +165,24 @@ def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, sa
     assert "frame_3.png (" in line and "frame_16.png (" in line and line.count("dB") == 2
 
 
+def test_photos_that_cannot_be_read_are_named_and_left_out(scene, views, tmp_path, said):
+    """Of the first, which is held out, the end is missing; the other is no photo."""
+    folder = write_photos(scene, views, tmp_path / "images")
+    write_colmap_text(views, tmp_path / "sparse/0")
+    first, other = folder / name_of(0), folder / name_of(5)
+    first.write_bytes(first.read_bytes()[:-2000])
+    other.write_bytes(b"no photo")
+    found = read_posed_photos(scene, folder)
+    assert (len(found.training), len(found.held_out)) == (14, 2)
+    [line] = [line for line in said.messages if line.startswith("photos that cannot be used are left out: ")]
+    assert f"{first}: cannot be read as a photo" in line and f"{other}: cannot be read as a photo" in line
+    assert len(read_posed_photos(scene, folder, training=False).held_out) == 2
+    for path in folder.iterdir():
+        path.write_bytes(b"no photo")
+    with pytest.raises(DataError, match="cannot be read as a photo"):
+        read_posed_photos(scene, folder)
+
+
 def test_names_that_do_not_match_are_told_with_examples_of_both(scene, views, tmp_path):
     folder = write_photos(scene, views, tmp_path / "images")
     for index, path in enumerate(sorted(folder.iterdir())):
@@ -227,9 +250,8 @@ def sample_around(views: ps.Views) -> ps.Views:
 
 
 @pytest.mark.parametrize("how", ["python", "command"])
-def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, monkeypatch, said, capsys):
+def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, said, capsys):
     """What only photos know: other colours than those of the scene."""
-    monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
     folder = write_photos(scene.replace(features_dc=scene.features_dc + 0.3), views, tmp_path / "my photos")
     model = write_colmap_binary(views, tmp_path / "model")
     ps.save(scene, tmp_path / "room.ply")
@@ -245,6 +267,30 @@ def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, mon
         out = capsys.readouterr().out
         assert re.search(TEXT, out) and "trained on 13 photos by 40 steps" in out
         assert len(ps.load(tmp_path / "small.ply")) == 250
+
+
+@pytest.mark.parametrize("how", ["python", "prune", "tradeoff"])
+def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, said, capsys, plain_page, no_lpips):
+    shown = scene.replace(features_dc=scene.features_dc + 0.3) if how == "tradeoff" else scene
+    folder, model = write_photos(shown, views, tmp_path / "images"), write_colmap_binary(views, tmp_path / "model")
+    path = tmp_path / "room.ply"
+    ps.save(scene, path)
+    words = ["--photos", str(folder), "--poses", str(model), "--keep", "50%"]
+    if how == "tradeoff":
+        main(["tradeoff", str(path), *words, "--repairs", "none", "photos", "-o", str(tmp_path / "trade")])
+        sweep = json.loads((tmp_path / "trade" / "tradeoff.json").read_text())
+        _, merged, trained = (point["against_photos"]["psnr"] for point in sweep["points"])
+        assert trained > merged + 1 and f"held-out photos of {folder}" in capsys.readouterr().out
+        command = sweep["points"][2]["command"]
+        assert f"--photos {folder}" in command and f"--poses {model}" in command
+        return
+    if how == "python":
+        ps.prune(scene, "50%", photos=folder, views=model)
+    else:
+        main(["prune", str(path), *words, "-o", str(tmp_path / "small.ply")])
+    text = said.text if how == "python" else capsys.readouterr().out
+    pruned, dense = map(float, re.search(TEXT.replace(r"([\d.]+) -> ", ""), text).groups())
+    assert dense > pruned + 1
 
 
 TEXT = r"held-out photos: ([\d.]+) -> ([\d.]+) dB PSNR in 3 photos, of the dense scene ([\d.]+) dB"

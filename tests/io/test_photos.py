@@ -140,6 +140,21 @@ def test_alpha_is_laid_over_black_and_masks_count_where_white(tmp_path):
     assert photo.mask is not None and photo.mask[:24].all() and not photo.mask[24:].any()
 
 
+@pytest.mark.parametrize("name", ["a.png.png", "a.png"])
+def test_masks_beside_the_folder_of_photos_count_where_cameras_name_none(name, tmp_path):
+    path = saved(noise(), tmp_path / "images" / "left" / "a.png")
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:24] = 255
+    saved(mask, tmp_path / "masks" / "left" / name)
+    reader = PhotoReader(tmp_path, 1000, tmp_path / "images")
+    photo = reader.read(path, camera())
+    assert photo.mask is not None and photo.mask[:24].all() and not photo.mask[24:].any()
+    (tmp_path / "masks" / "left" / name).write_bytes(b"no mask")
+    with pytest.raises(DataError, match=f"{name}: cannot be read as a mask"):
+        reader.read(path, camera())
+    assert reader.read(saved(noise(), tmp_path / "images" / "b.png"), camera()).mask is None
+
+
 def test_a_photo_is_turned_by_exif_where_its_camera_is(tmp_path):
     exif = Image.Exif()
     exif[274] = 6

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
+from lab.common.compare import dataset_photos
 from lab.common.running import has_finished, remove_interrupted
 from lab.tables import layout, scenes
 from lab.tables.measure import measure_tables
 from lab.tables.scenes import differences, paper_dataset
 from making import write_run
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
 
 
 def files(folder: Path) -> dict[Path, bytes]:

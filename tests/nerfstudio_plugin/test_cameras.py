@@ -15,9 +15,10 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, carried, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
@@ -107,8 +108,8 @@ def run(trained_walls) -> Path:
 
 def mean_psnr(scene: Gaussians, run: Path) -> float:
     """In the held-out photos of a run, dB."""
-    views, photos = dataset_photos(run, "test", 10)
-    errors = [ps.psnr(ps.render(scene, view), photo) for view, photo in zip(views, photos, strict=True)]
+    photos = run_photos(run, "test")
+    errors = [ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos]
     return float(torch.stack(errors).mean())
 
 

@@ -12,7 +12,7 @@ import pointsplat_ns as ps
 from making import run_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, training_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 
 NUM_TRAIN, SEED = 9, 5
@@ -61,9 +61,8 @@ def test_training_poses_are_corrected_as_by_nerfstudios_model(mode, key, trained
     held_out = (ps.dataset_views(path, "test").viewmats for path in (run_of(trained_walls, "wall-b"), run))
     assert torch.equal(*held_out), "these have no correction"
     views = viewmats_from_opengl(expected)
-    photos = training_photos(run)
-    for found in (ps.dataset_views(run).viewmats, dataset_photos(run, "train", 99)[0].viewmats):
-        assert torch.allclose(found, views, atol=1e-6)
+    photos = run_photos(run)
+    assert torch.allclose(ps.dataset_views(run).viewmats, views, atol=1e-6)
     assert torch.allclose(torch.stack([photo.view.viewmat for photo in photos]), views, atol=1e-6)
     for supervision in ("photos", "dense"):
         frames = ScenesDataManagerConfig(data=run, supervision=supervision).setup(test_mode="val").training_frames(0)

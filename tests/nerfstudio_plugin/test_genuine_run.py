@@ -8,8 +8,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import SHARED_DATA
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_photos, dataset_views
+from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, run_photos
 
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
@@ -37,11 +38,11 @@ def test_its_checkpoint_is_read_to_the_bit(run):
 
 
 def test_its_renders_show_its_held_out_photos(run):
-    views, photos = dataset_photos(run, "test", 5)
+    photos = run_photos(run, "test")
     assert len(photos) == 5 and len(dataset_views(run)) == 45
     scene = ps.load(run)
-    grey = [ps.render(scene, view).mean(dim=-1).flatten() for view in views]
-    seen = [photo.mean(dim=-1).flatten() for photo in photos]
+    grey = [ps.render(scene, photo.view).mean(dim=-1).flatten() for photo in photos]
+    seen = [in_unit_range(photo.target).mean(dim=-1).flatten() for photo in photos]
     alike = torch.corrcoef(torch.stack([*grey, *seen]))[:5, 5:]
     # a ninth of a scene just behind a reset of its opacities is dark: its PSNR tells nothing, its structure does
     assert torch.equal(alike.argmax(dim=0), torch.arange(5)), alike  # the render that is most like each photo

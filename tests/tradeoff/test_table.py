@@ -12,6 +12,7 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
+from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking import view_source
@@ -113,8 +114,8 @@ def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
 
 
 def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
-    photos = [(photo + 0.05).clamp(0, 1) for photo in ps.render(ps.load(room), room_views)]
-    result = new_sweep(tmp_path, lambda count: (room_views[:count], photos[:count]), views=2).run(TENTH)
+    photos = [Example(view, (ps.render(ps.load(room), view) + 0.05).clamp(0, 1)) for view in room_views]
+    result = new_sweep(tmp_path, lambda: photos, views=2).run(TENTH)
     assert result.views_origin == "held-out photos of the dataset" and "held-out photos" in result.why
     assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
     assert result.points[1].against_photos is not None
@@ -122,7 +123,7 @@ def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room
 
 
 def test_photos_that_cannot_be_had_are_named_and_left_out(new_sweep, tmp_path):
-    def gone(count):
+    def gone():
         raise DataError("photo_3.jpg: no such file")
 
     result = new_sweep(tmp_path, gone).run(TENTH)

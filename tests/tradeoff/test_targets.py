@@ -11,6 +11,7 @@ import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns import folders
 from pointsplat_ns.compression import repair
+from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.quality import quality_of_file
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import bytes_text
@@ -178,12 +179,17 @@ def test_a_folder_with_a_target_that_no_scene_meets_says_so_for_each(tmp_path, d
 
 
 def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(dense, room_views):
-    photos = [torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))] * 3
-    subject = replace(subject_of(dense, None), held_out=lambda count: (room_views, photos))
-    (views, small, _), _ = views_to_judge(replace(subject, resolution=(24, 18)), 3)
-    assert (views.width, views.height) == (24, 18)
-    assert torch.allclose(small[0], photos[0].reshape(18, 2, 24, 2, 3).mean(dim=(1, 3)), atol=1e-6)
-    assert views_to_judge(subject, 3)[0].photos is photos
+    photo, mask = torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0)), torch.arange(48) < 25
+    photos = [Example(view, photo, mask.expand(36, -1)[..., None]) for view in room_views]
+    turned = Example(replace(room_views[0], width=36, height=48), photo.transpose(0, 1))
+    subject = replace(subject_of(dense, None), held_out=lambda: [turned, *photos[1:]])
+    (views, small, _), note = views_to_judge(replace(subject, resolution=(24, 18)), 3)
+    assert (len(views), views.width, views.height) == (2, 24, 18) and note.startswith("1 of 3 held-out photos")
+    assert torch.equal(views.viewmats, room_views.viewmats[1:])
+    assert torch.allclose(small[0].target, photo.reshape(18, 2, 24, 2, 3).mean(dim=(1, 3)), atol=1e-6)
+    assert small[0].mask.sum() == 18 * 13
+    whole = views_to_judge(replace(subject, held_out=lambda: photos), 3)[0]
+    assert torch.equal(whole.photos[0].target, photo) and torch.equal(whole.views.Ks, room_views.Ks)
 
 
 def test_lpips_is_given_where_weights_are_at_hand(dense, some_lpips):
