@@ -112,7 +112,7 @@ class Quality:
             return line
         if not self.photos.kept:
             return f"{self.photos}; {line}"
-        return f"{self.photos}; against the dense scene, no longer the aim, {line.partition(': ')[0]}"
+        return f"{self.photos}; {line.partition(': ')[0]} against the dense scene"
 
     @property
     def details(self) -> str:
