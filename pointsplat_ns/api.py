@@ -20,16 +20,13 @@ from pointsplat_ns.compression.trained_refiner import (
     refine,
     scenes_of_run,
 )
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.earth import Place
-from pointsplat_ns.io.formats import STREAM_META, format_to_write
-from pointsplat_ns.io.outputs import claimed, claimed_folder
+from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.folder import check_folder, check_level_folder
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
-from pointsplat_ns.levels.tiles import TILESET
+from pointsplat_ns.levels.writing import LevelOutput
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.stream_page import stream_page
@@ -288,40 +285,20 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    if html and (not stream or folder is None):
-        raise PointSplatError("a page is written beside a stream; expected --stream with --html")
-    if stream and tiles or at is not None and not tiles:
-        raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
-    if at is not None:
-        Place.parse(at)
+    output = LevelOutput.of(folder, stream, tiles, html, at, up, force)
     viewer = web_viewer() if html else None
-    paged = folder is not None and Path(folder).suffix.lower() == ".rad" and not (stream or tiles)
     with ExitStack() as stack:
-        if folder is not None and paged:
-            stack.enter_context(claimed(Path(folder), force))
-        elif folder is not None:
-            if stream or tiles:
-                check_folder(Path(folder), (TILESET if tiles else STREAM_META, *(viewer or ())), force)
-            else:
-                check_level_folder(Path(folder), len(budgets), force)
-            stack.enter_context(claimed_folder(Path(folder)))
+        if output is not None:
+            stack.enter_context(output.claim(len(budgets), tuple(viewer or ())))
         dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
         page = None
-        if viewer is not None and folder is not None:
+        if viewer is not None and output is not None:
             known = view_source.known(VIEW_COUNTS.opening)
-            page = stream_page(viewer, dense, known, up_named(up), Path(folder).resolve().name)
+            page = stream_page(viewer, dense, known, up_named(up), output.path.resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
-        if folder is not None and stream:
-            made.save_stream(folder, force, report, page)
-            made = made.of_stream(folder, page)
-        elif folder is not None and paged:
-            made.save_paged(folder, report)
-        elif folder is not None and tiles:
-            made.save_tiles(folder, at, up, force, report)
-        elif folder is not None:
-            made.save(folder, force)
+        made = made if output is None else output.write(made, page, report)
     log((*made.notes, *([page.note] if page else [])))
     return made
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.formats.holding import typical_sizes
-from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth, pixel_size_for
@@ -190,18 +189,6 @@ class Levels:
             return [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
         pixel = self.distance / float(self.reference.views.Ks[:, 1, 1].median())
         return [pixel_size_for(level.errors, self.farther, pixel) for level in self if level.errors is not None]
-
-    def of_stream(self, folder: str | Path, page: StreamPage | None = None) -> Levels:
-        """The same levels, judged as they are in the stream that :meth:`save_stream` wrote."""
-        levels = []
-        for index, level in enumerate(self):
-            errors = level.errors
-            if self.judge is not None and errors is not None:
-                read = read_sog_stream(folder, index)
-                read = read if page is None or page.turn is None else page.turn.inverse().apply(read)
-                errors = replace(errors, near=self.judge.quality(read))
-            levels.append(replace(level, errors=errors))
-        return replace(self, levels=tuple(levels))
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
