@@ -88,11 +88,11 @@ def lod(
 
 def _print_table(made: Levels, folder: Path) -> None:
     from pointsplat_ns.compression.quality import word_for
+    from pointsplat_ns.io.discovery import FOLDER_FILES
     from pointsplat_ns.io.files import bytes_text, three_digits
-    from pointsplat_ns.io.formats import STREAM_META
     from pointsplat_ns.pruning import ply_bytes
 
-    stream = (folder / STREAM_META).exists()
+    apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
     rows = []
     for index, level in enumerate(made):
         near = level.errors and level.errors.near
@@ -101,14 +101,15 @@ def _print_table(made: Levels, folder: Path) -> None:
                 f"level_{index}",
                 f"{len(level.scene):,}",
                 f"{100 * len(level.scene) / len(made.dense):.3g} %",
-                "-" if stream else three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6),
+                three_digits(ply_bytes(len(level.scene), level.scene.sh_degree) / 1e6) if apart else "-",
                 f"{level.seconds:.1f}",
                 psnr_text(near.psnr if near else None),
                 f"{near.ssim:.2f}" if near and near.ssim is not None else "-",
                 word_for(near.psnr) if near else "-",
             )
         )
-    size = bytes_text(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
+    files = [path for path in (folder, *folder.rglob("*")) if path.is_file()]
+    size = bytes_text(sum(path.stat().st_size for path in files))
     print(f"{folder}: {counted(len(made), 'level')} of {len(made.dense):,} Gaussians, {size} in all")
     header = ("", "Gaussians", "share", "MB", "seconds", "dB", "SSIM", "")
     print_table(header, rows, "dB: PSNR against the dense scene", left=(0, 7))

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, box_room
 from pointsplat_ns.cli import main
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 
@@ -68,6 +70,16 @@ def test_lod_and_tradeoff_print_their_files(ply, as_json, plain_page, no_lpips, 
         "output": "room_tradeoff",
         **json.loads(Path("room_tradeoff/tradeoff.json").read_text("utf-8")),
     }
+
+
+@pytest.mark.parametrize("form", [["-o", "levels.rad"], ["--tiles"], ["--stream"]])
+def test_lod_prints_the_size_of_what_it_writes_and_of_no_ply(form, ply, capsys):
+    main(["lod", str(ply), "--levels", "50%", *form])
+    said = capsys.readouterr().out
+    path = Path(re.search(r"(?m)^(.+): 2 levels of ", said)[1])
+    files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+    assert f", {bytes_text(sum(file.stat().st_size for file in files))} in all" in said
+    assert [line.split("│")[4].strip() for line in said.splitlines() if "level_" in line] == ["-", "-"]
 
 
 def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys, monkeypatch):
