@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pointsplat_ns.compression.quality import Judge, read_back
+from pointsplat_ns.compression.quality import Judge, quality_line, read_back
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
@@ -73,8 +73,7 @@ class SceneResult:
     """Path of the file or run that was read."""
     output: str
     """Path of the file that was written."""
-    status: Status
-    """``done before``: by an earlier call, or by another process. ``open``: not finished, in the table of all."""
+    status: Status  # ``done before``: by an earlier call or another process. ``open``: not finished
     before: int | None = None
     """Gaussians of the scene."""
     after: int | None = None
@@ -91,6 +90,10 @@ class SceneResult:
     """The error in one line; empty if there was none."""
     note: str = ""
     """A remark on the result; empty if there is none."""
+
+    def __str__(self) -> str:
+        """What users read of a result."""
+        return "; ".join(filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note)))
 
 
 Show = Callable[[Sequence[SceneResult]], None]
@@ -111,8 +114,7 @@ class SmallerScene:
 
 @dataclass(frozen=True)
 class Command:
-    """A command to run on every scene. It is pickled for other processes, so ``make`` has to be a function of a module,
-    or a partial of one."""
+    """A command to run on every scene. Other processes get it pickled: functions are those of modules, or partial."""
 
     name: str
     make: Callable[[Gaussians, Path], SmallerScene]
@@ -162,9 +164,8 @@ def run_on_folder(
     progress: bool | Progress = False,
     show: Show | None = None,
 ) -> list[SceneResult]:
-    """Run a command on every scene of a folder, and write the results to another folder. ``show`` is called at the
-    end, also after an interruption. Other arguments, results and errors are those of
-    :func:`~pointsplat_ns.folders.compact_folder`."""
+    """Run a command on every scene of a folder, and write the results to another. ``show`` is called at the end, also
+    after an interruption. Other arguments, results and errors: :func:`~pointsplat_ns.folders.compact_folder`."""
     check_jobs(jobs)
     if os.path.realpath(folder) == os.path.realpath(output):
         raise SceneError(f"{output}: holds the scenes themselves; name another folder for the results")
@@ -180,8 +181,7 @@ def run_on_folder(
             for wait in (False, True):  # at last for those that another command works on
                 left = [(task, wait) for task in tasks if task.name not in results]
                 for (task, _), result in work.results(left):
-                    if isinstance(result, WorkerKilled):
-                        result = task.result("failed", error=str(result))
+                    result = task.result("failed", error=str(result)) if isinstance(result, WorkerKilled) else result
                     if result is None:
                         continue
                     results[task.name] = result

@@ -115,8 +115,7 @@ def _sizes(result: SceneResult) -> tuple[str, str]:
 def _facts(result: SceneResult, path: Path, pictures: list[str]) -> dict[str, Any]:
     """What the page at a path says of a scene."""
     finished = result.megabytes is not None
-    quality = "" if result.psnr is None else f"{result.psnr:.1f} dB PSNR against the scene's own renders"
-    said = "; ".join(filter(None, (quality, result.note))) if finished else result.error or "not finished"
+    said = str(result) if finished else result.error or "not finished"
     link = quote(Path(os.path.relpath(result.output, path.parent)).as_posix()) if finished else ""
     return {
         "name": result.name, "file": Path(result.output).name, "link": link, "pictures": pictures,
