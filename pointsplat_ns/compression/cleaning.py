@@ -13,6 +13,7 @@ pictures need.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
 import torch
@@ -176,12 +177,13 @@ def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
 def clean_scene(
     dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent, strength: float | None = None
 ) -> Cleaning:
-    """Find the junk of a scene, and measure the PSNR of renders without it. Views decide what floats, and what they
-    show is not unseen; without a strength they decide nothing. At least ``at_least`` Gaussians, in 1..N, remain."""
-    try:
-        floating = None if strength is None else views.scored(VIEW_COUNTS.scored)
-    except DataError:  # no views
-        floating = None
+    """Find the junk of a scene, and measure the PSNR of renders without it. Views decide what floats, if there is a
+    strength, and what they show is not unseen; sampled ones decide nothing without a strength. At least ``at_least``
+    Gaussians, in 1..N, remain."""
+    floating = None
+    with suppress(DataError):  # no views
+        if strength is not None or views.known(1) is not None:
+            floating = views.scored(VIEW_COUNTS.scored)
     junk = find_junk(dense, progress, floating, strength or 0.0)
     dropped = junk.first(len(dense) - at_least)
     if len(dropped.indices) == 0:
@@ -198,7 +200,7 @@ def clean_scene(
         (dropped.undrawable, dropped.undrawable, "that cannot be drawn"),
         (dropped.unseen, hidden, f"that are seen from nowhere ({places})"),
     ]
-    if floating is not None:
+    if floating is not None and strength is not None:
         found = counted(len(clusters(dense[dropped.floating.to(dense.device)]).unique()), "cluster")
         rules.append((dropped.floating, dropped.indices, f"that float before what {len(floating)} views show, {found}"))
     notes = []

@@ -217,6 +217,9 @@ def test_what_a_given_view_shows_is_not_unseen(room):
     hidden, shown = {*find_junk(scene).unseen.tolist()}, {*find_junk(scene, floating=behind).unseen.tolist()}
     near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
     assert near <= hidden and not near & shown
+    cleanings = [clean_scene(scene, 1, source) for source in (ViewSource(scene, given=behind), ViewSource(scene))]
+    assert [near & {*cleaning.junk.unseen.tolist()} for cleaning in cleanings] == [set(), near]
+    assert not any(len(cleaning.junk.floating) or "float" in str(cleaning.notes) for cleaning in cleanings)
 
 
 def test_the_score_is_its_formula():
