@@ -57,7 +57,7 @@ RUNS = {
     "info room.ply": "600 Gaussians",
     "prune room.ply --keep 10%": "merged to 60 of 600",
     "compact room.ply --keep 30% --effort instant --html small.html": "small.html",
-    "lod room.ply --levels 30%": "1 levels of 600 Gaussians",
+    "lod room.ply --levels 30%": "1 level of 600 Gaussians",
     "tradeoff room.ply --keep 10% --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
     "convert room.ply room.spz": "600 Gaussians",
     "convert room.ply room.sog": "600 Gaussians",

@@ -160,7 +160,7 @@ def clusters(scene: Gaussians) -> Tensor:
     distances, near = nearest(scene.means, 16)
     reach = 2 * scene.stds.amax(1).double().cpu()
     first, rank = (distances <= reach[:, None] + reach[near]).nonzero().unbind(1)
-    links = coo_matrix((torch.ones(len(first)), (first, near[first, rank])), (len(scene), len(scene)))
+    links = coo_matrix((torch.ones(len(first), **DOUBLES), (first, near[first, rank])), (len(scene), len(scene)))
     labels = torch.from_numpy(connected_components(links, directed=False)[1]).long()
     return labels.bincount().argsort(descending=True, stable=True).argsort()[labels]
 

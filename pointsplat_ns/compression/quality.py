@@ -77,7 +77,7 @@ class PhotoGain:
 
     def __str__(self) -> str:
         if self.kept:
-            return f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} photos"
+            return f"{self.before:.1f} -> {self.after:.1f} dB in {self.photos} training photos"
         return f"{self.before:.1f} dB in {self.photos} photos, which training on them does not raise"
 
 

@@ -23,6 +23,7 @@ from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import fit, read_png
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
     frame = FlightFrame.of(before, known)
     views = frame.views.resized(WIDTH)
     view = views.resized(round(max(views.width, views.height) * min(1.0, HEIGHT / views.height)))[0]
-    pair = torch.zeros(HEIGHT, 2 * WIDTH, 3)
+    pair = torch.zeros(HEIGHT, 2 * WIDTH, 3, **FLOATS)
     top, left = (HEIGHT - view.height) // 2, (WIDTH - view.width) // 2
     for start, scene in ((left, before), (left + WIDTH, after)):
         drawn = render(in_units(scene, frame.centre.to(scene.device), frame.size), view)

@@ -145,7 +145,7 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
             weights = pictures.weights(single, _camera(scene, view), ALPHA_MIN, MOST_PAIRS)
             if weights is not None:
                 return weights
-    return pixel_sums(scene, view, torch.ones(view.height, view.width, 1, device=scene.device), compiled)[:, 0]
+    return pixel_sums(scene, view, single.means.new_ones(view.height, view.width, 1), compiled)[:, 0]
 
 
 def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None = None) -> Tensor:

@@ -45,7 +45,7 @@ def test_info_prints_a_page_or_json(scene, capsys):
     assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".sog" in said
     found = ps.info(scene)
     assert said.startswith(f"{scene}: 3DGS PLY, {bytes_text(scene.stat().st_size)}\n")
-    assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 6 v" in said
+    assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 12 v" in said
     run("info", scene, "--json")
     assert json.loads(capsys.readouterr().out) == found.as_dict()
 

@@ -103,6 +103,5 @@ def test_each_place_that_starts_processes_is_known():
             if starts & {*names, *(name.partition(".")[0] for name in names)} or (called and node.attr in calls):
                 found.add(str(path.relative_to(REPOSITORY / "pointsplat_ns")))
     assert found == {
-        "system/memory.py",  # Python itself, with the same path
         "system/workers.py",  # Python itself, without the current folder on its path
     }

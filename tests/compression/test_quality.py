@@ -64,7 +64,7 @@ def test_one_line_says_how_good_a_scene_is(psnr, line):
 
 def test_photos_lead_where_they_were_trained_on():
     trained = replace(SOME, photos=PhotoGain(19.24, 26.1, 12, kept=True))
-    assert str(trained) == ("19.2 -> 26.1 dB in 12 photos; 28.8 dB, SSIM 0.91 against the dense scene")
+    assert str(trained) == ("19.2 -> 26.1 dB in 12 training photos; 28.8 dB, SSIM 0.91 against the dense scene")
     left_out = replace(SOME, photos=PhotoGain(19.24, 19.1, 12, kept=False))
     assert str(left_out) == (
         "19.2 dB in 12 photos, which training on them does not raise; 28.8 dB, SSIM 0.91: edges of small things blur"

@@ -242,6 +242,6 @@ def test_up_is_named_or_estimated_and_fill_is_that_of_the_views():
     found, named = ps.info(scene, **view), ps.info(scene, up="-y", **view)
     assert found.up_text.startswith("z") and found.up == [0, 0, 1]
     assert named.up_text == "-y" and not named.up_is_guess
-    views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(6)
+    views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(12)
     assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(found.fill)
     assert named.views == f"{len(views)} views of 64 x 48 pixels"

@@ -4,6 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from lab.numerics import reference
 from pointsplat_ns.geometry.transforms import (
     SHORTEST,
     quaternions_of,
@@ -12,7 +13,6 @@ from pointsplat_ns.geometry.transforms import (
     unit_rows,
     zero_as_identity,
 )
-from pointsplat_ns.rasterizer import reference
 from pointsplat_ns.refiner.refiner import canonical_quats
 
 

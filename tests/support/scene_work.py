@@ -7,9 +7,21 @@ from pathlib import Path
 
 import torch
 
+from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.scene_folder import SmallerScene
+
+
+class OfThirty(Judge):
+    """Judges each scene alike."""
+
+    def __init__(self, dense: Gaussians, source: ViewSource):
+        """Nothing is drawn."""
+
+    def psnr(self, scene: Gaussians, progress: object = None) -> tuple[float, float]:
+        return 30.0, 30.0
 
 
 def halve(scene: Gaussians, path: Path, journal: Path) -> SmallerScene:
@@ -25,7 +37,7 @@ def halve(scene: Gaussians, path: Path, journal: Path) -> SmallerScene:
         raise SceneError(f"{path}: is bad")
     if path.stem.startswith("deadly") or (path.stem.startswith("killed") and seen == 1):
         os.kill(os.getpid(), signal.SIGKILL)
-    return SmallerScene(scene[::2], 30.0)
+    return SmallerScene(scene[::2], OfThirty(scene, ViewSource(scene)))
 
 
 def where(seconds: float) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from making import box_room, same_bits
 from pointsplat_ns import folders
 from pointsplat_ns.compression import repair
 from pointsplat_ns.compression.optimiser import Example
-from pointsplat_ns.compression.quality import quality_of_file
+from pointsplat_ns.compression.quality import decibels, quality_of_file
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.looking import view_source
@@ -52,7 +52,7 @@ def test_the_file_that_is_written_has_the_quality(dense, room_views, tmp_path, s
     assert mean_psnr(ps.load(tmp_path / f"found{suffix}"), dense, room_views) >= 25 - 1e-3  # sums in another order
     size = (tmp_path / f"found{suffix}").stat().st_size
     said = quality_of_file(dense, ViewSource(dense), found.scene, tmp_path / f"found{suffix}", suffix)
-    assert said.psnr >= 25 and f": {said.psnr:.1f} dB against the dense scene in 3 views of 48 x 36" in found.target
+    assert said.psnr >= 25 and f": {decibels(said.psnr)} against the dense scene in 3 views of 48 x 36" in found.target
     assert f", {bytes_text(size)}, {len(found.scene):,} Gaussians" in found.target
     assert "the next cheaper, " in found.target and "dB, less than 25 dB" in found.target
 
