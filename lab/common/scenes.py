@@ -12,7 +12,7 @@ from pointsplat_ns.io import open_run, scene_name
 TUNING = (
     *("apt_bathroom", "bouquet", "pc_flowers", "pc_statue_massa", "plant_pilea", "kettle_pod"),
     *("pc_statue_angel", "pc_statue_narcissus", "pc_statue_trumpet", "kitchen", "fox", "final_3dgs", "vr_project"),
-    *("room", "room5", "meeting", "drone_hall", "figure", "ray"),
+    *("room", "room5", "meeting", "drone_hall", "figure", "ray", "headquarter_garden"),
 )
 """Scenes that constants may be chosen on."""
 
