@@ -2,6 +2,7 @@
 
 import math
 from itertools import count
+from unittest import mock
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from nerfstudio.utils import writer
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import dense_config, equal
 from pointsplat_ns.errors import PointSplatError
+from pointsplat_ns.nerfstudio_plugin.pointsplat import trainer as module
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer, rate_factor_at
 
@@ -28,6 +30,15 @@ def timed(three_rooms, folder, seconds, **changes):
     for name, value in changes.items():
         setattr(config, name, value)
     return config
+
+
+def steps_saved(trainer) -> list[int]:
+    return sorted(int(path.stem.split("-")[1]) for path in trainer.checkpoint_dir.glob("*.ckpt"))
+
+
+def saved_seconds(trainer, step: int) -> float:
+    path = trainer.checkpoint_dir / f"step-{step:09d}.ckpt"
+    return torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["seconds"]
 
 
 @pytest.mark.parametrize(
@@ -52,11 +63,10 @@ def test_rates_follow_the_share_of_the_training_also_at_extremes(schedule, share
 
 
 def test_training_ends_when_the_time_is_over_with_rates_that_fit_it(three_rooms, run_training, tmp_path):
-    trainer, losses = run_training(timed(three_rooms, tmp_path, 45.0))
+    with mock.patch.object(module, "SECONDS_BETWEEN_CHECKPOINTS", 3 * STEP):  # where steps are slow
+        trainer, losses = run_training(timed(three_rooms, tmp_path, 45.0))
     assert len(losses) == 5, "the step in which the time ends is a whole one"
-    (path,) = trainer.checkpoint_dir.glob("*.ckpt")
-    assert path.name == "step-000000004.ckpt"
-    assert torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["seconds"] == 50.0
+    assert steps_saved(trainer) == [2, 4] and [saved_seconds(trainer, step) for step in (2, 4)] == [30.0, 50.0]
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in trainer.optimizers.optimizers.items()}
     assert rates == pytest.approx({name: 0.02 * peak for name, peak in REFINER_RATES.items()}, rel=1e-12)
     assert (trainer.base_dir / "refiner.safetensors").is_file()
