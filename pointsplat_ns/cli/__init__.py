@@ -117,10 +117,12 @@ def _ended_by_signals() -> Iterator[None]:
 
 def _what_failed(error: Exception) -> str:
     """An error of the system in one line."""
-    from pointsplat_ns.io.files import one_line
-
     if isinstance(error, ModuleNotFoundError):
         return f"{error.name} is not installed; pip install pointsplat-ns adds what is missing"
+    if isinstance(error, ImportError):
+        return f"{error}; torch takes 4 GB of address space (ulimit -v)"
+    from pointsplat_ns.io.files import one_line  # which imports torch
+
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, RecursionError):
@@ -131,10 +133,13 @@ def _what_failed(error: Exception) -> str:
 
 
 def _is_bug(error: Exception) -> bool:
-    """Whether an error is none of the input or of the machine: a module of ours that is missing, or a RuntimeError
+    """Whether an error is none of the input or of the machine: a module of ours that is missing, a name that a
+    module lacks, or a RuntimeError
     other than of torch's memory, which has no type of its own on a CPU."""
     if isinstance(error, ModuleNotFoundError):
         return error.name is None or error.name.startswith(__package__.partition(".")[0])
+    if isinstance(error, ImportError):
+        return "shared object" not in str(error)
     if not isinstance(error, RuntimeError) or isinstance(error, RecursionError):
         return False
     import torch
@@ -193,7 +198,7 @@ def main(args: list[str] | None = None) -> None:
         except BrokenPipeError:  # of `pointsplat ... | head`
             discard_output()
             sys.exit(1)
-        except (ModuleNotFoundError, OSError, MemoryError, RuntimeError) as error:
+        except (ImportError, OSError, MemoryError, RuntimeError) as error:
             if _is_bug(error):
                 raise
             text, status = f"error: {printable(_what_failed(error))}", 1

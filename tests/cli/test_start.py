@@ -1,5 +1,6 @@
 """The first moments of the program."""
 
+import resource
 import subprocess
 import sys
 
@@ -51,6 +52,19 @@ def test_files_that_are_missing_are_all_named_before_torch_is_imported(tmp_path)
     said = [f"error: a.ply: no such file{expected}"] * len(alone)
     assert done.stderr.splitlines() == said + [f"error: a.ply, b.ply: no such files{expected}"] * len(both)
     assert (done.returncode, done.stdout, [*tmp_path.iterdir()]) == (0, "", [])
+
+
+def test_too_little_address_space_for_torch_is_one_line(tmp_path):
+    """With a little more of it, the import of torch aborts the program."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (10**9, 10**9))
+
+    words = [sys.executable, "-c", "from pointsplat_ns.start import program; program()", "info", "room.ply"]
+    (tmp_path / "room.ply").touch()
+    done = subprocess.run(words, capture_output=True, text=True, preexec_fn=limit, cwd=tmp_path)
+    assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert "; torch takes 4 GB of address space (ulimit -v)" in done.stderr
 
 
 @pytest.mark.parametrize(
