@@ -14,6 +14,7 @@ from typing import Annotated
 
 import tyro
 
+import pointsplat_ns as ps
 from lab.common.printing import console, number, start, table
 from lab.common.results import Row, write_json
 from lab.judge.camera_paths import path_of, views_of
@@ -21,7 +22,6 @@ from lab.judge.scenes import DenseViews
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.io.formats.sog_stream import coarser_levels
-from pointsplat_ns.merging import merge
 
 
 def main(
@@ -58,7 +58,7 @@ def main(
     del levels
     for count in counts:
         begin = time.process_time()
-        small = merge(finest, count).scene
+        small = ps.prune(finest, count)
         judge("prune", small, time.process_time() - begin)
     write_json(json_path, rows)
     dB = number(1)
