@@ -17,6 +17,9 @@ from pointsplat_ns.levels.tiles import TILESET
 from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress
 
+Form = Literal["folder", "stream", "tiles", "paged"]
+"""A folder with a file for each level, a streamed SOG, 3D Tiles, or a RAD file."""
+
 
 @dataclass(frozen=True)
 class LevelOutput:
@@ -24,7 +27,7 @@ class LevelOutput:
 
     path: Path
     """A folder; of the form "paged" a file."""
-    form: Literal["folder", "stream", "tiles", "paged"]
+    form: Form
     at: str | None
     """Where the scene lies on the Earth, for tiles."""
     up: str | None
@@ -44,8 +47,8 @@ class LevelOutput:
         if path is None:
             return None
         paged = Path(path).suffix.lower() == ".rad"
-        form: Literal["folder", "stream", "tiles", "paged"] = "paged" if paged else "folder"
-        return LevelOutput(Path(path), "stream" if stream else "tiles" if tiles else form, at, up, force)
+        form: Form = "stream" if stream else "tiles" if tiles else "paged" if paged else "folder"
+        return LevelOutput(Path(path), form, at, up, force)
 
     def claim(self, count: int, page: tuple[str, ...]) -> AbstractContextManager[object]:
         """Check that ``count`` levels, and a page of some files, can be written; no other program writes there while
