@@ -2,6 +2,7 @@
 
 import json
 import math
+import signal
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -235,3 +236,11 @@ def hollow_ball(make_hollow_ball) -> Gaussians:
 def ball_views(hollow_ball: Gaussians) -> Views:
     """Four small views from within."""
     return sample_views(hollow_ball, 4, 64, 48)
+
+
+@pytest.fixture(autouse=True)
+def signals_as_they_were():
+    """Whatever a test starts, SIGTERM ends the process afterwards as it did before."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    assert signal.getsignal(signal.SIGTERM) == before
