@@ -6,10 +6,11 @@ import inspect
 import re
 import runpy
 import shlex
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,7 +136,9 @@ def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Start a console script, or a program of the lab by ``python -m module``, in this process."""
-    with monkeypatch.context() as patch, warnings.catch_warnings():
+    before = signal.getsignal(signal.SIGTERM)
+    with monkeypatch.context() as patch, warnings.catch_warnings(), ExitStack() as after:
+        after.callback(signal.signal, signal.SIGTERM, before)  # a program that has a process to itself may change it
         if words[:2] == ("python", "-m"):
             warnings.simplefilter("ignore", RuntimeWarning)  # the module may be imported already
             patch.setattr(sys, "argv", [words[2], *words[3:]])

@@ -59,6 +59,7 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     # Step 10 densifies, which is not to be interrupted.
     assert stopped_at(10, config, run_training, monkeypatch, signal.SIGTERM) == 143
     said = capsys.readouterr()
+    assert "stopping after this step" in said.err and said.err.endswith("interrupted\n")
     run = open_run(config.get_base_dir())
     assert run.step == 10 and "Saved after step 10" in said.out
     scene = read_scene(run.folder)
