@@ -19,7 +19,6 @@ from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.coverage import coverage
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pruning.paper import log_volume
 from pointsplat_ns.rasterizer import render, render_with_alpha
@@ -100,7 +99,7 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
         path: the PNG file to write.
 
     Returns:
-        Text: the origin of the views, and the share of visible content in the views.
+        A line of text: how many views there are, and their origin.
 
     Raises:
         DataError: if there are no views.
@@ -109,14 +108,10 @@ def plot_views(dense: Gaussians, source: ViewSource, path: Path | str) -> str:
     views = source.views(VIEW_COUNTS.weighed)
     columns = 4
     pictures = [render(dense, view) for view in views.spread(columns**2).resized(320)]
-    share = coverage(dense, views)
     rows = [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
     rows[-1] += [torch.ones_like(pictures[0])] * (columns - len(rows[-1]))
     side_by_side(rows, [""] * columns, path)
-    return (
-        f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}\n"
-        f"at least two of the views show {share:.0%} of the visible content"
-    )
+    return f"{path}: {len(pictures)} of {len(views)} views of {views.width} x {views.height} pixels; {source.origin}"
 
 
 @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.system.threads import one_thread
+from pointsplat_ns.views import View
 
 __all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "rate_factor", "initial_rate_factor"]
 
@@ -133,11 +135,15 @@ class OptimisationRun:
 
 
 def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:
-    """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end."""
-    for view in views.others(count=count):
+    """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end. A view that comes
+    again is not drawn again, as long as it is among the last ``REPAIR.pictures_kept``."""
+
+    @functools.lru_cache(maxsize=REPAIR.pictures_kept)
+    def drawn(view: View) -> Tensor:
         with torch.no_grad():
-            target = render(dense, view)
-        yield Example(view, target)
+            return render(dense, view)
+
+    return (Example(view, drawn(view)) for view in views.others(count=count))
 
 
 def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:

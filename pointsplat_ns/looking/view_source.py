@@ -217,8 +217,9 @@ class ViewSource:
             yield dataclasses.replace(view, background=1 - view.background) if opposite else view
 
     def _in_turn(self, views: Views, seed: int) -> Iterator[View]:
-        """Views in random order, each once before any is repeated, then of the other size; without end."""
-        sizes, generator = two_sizes(views), random.Random(seed)
+        """Views in random order, each once before any is repeated, then of the other size; without end. A view that
+        comes again is the same object."""
+        sizes, generator = [[*of_size] for of_size in two_sizes(views)], random.Random(seed)
         for lap in counted():
             for index in generator.sample(range(len(views)), len(views)):
                 yield sizes[(lap + index) % 2][index]

@@ -93,7 +93,7 @@ def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):
     run("info", scene, "--views", sheet, "--resolution", "64x48")
     said = capsys.readouterr().out
     assert "of 64 x 48 pixels; sampled poses" in said and "up is " in said
-    assert "of the visible content" in said and sheet.read_bytes().startswith(b"\x89PNG")
+    assert sheet.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit):
         run("info", scene, "--views", sheet)
     assert "exists already" in capsys.readouterr().err
