@@ -1,26 +1,18 @@
-"""Accepts a change to a smaller scene: the share of it that brings renders closest to the dense scene's, or none.
+"""Accepts a change to a smaller scene, a refinement or a repair, or leaves it out.
 
-A refinement or repair is compared with the scene that it started from. It is kept if it gains in whole pictures of a
-middle size, lowers the error in at least half of the views, and harms no picture of another size. Changes often have
-the right direction and too large a length. So two more shares are tried: half of the change, and the minimum of the
-parabola through the errors at 0, 1/2 and 1. The error is exactly such a parabola if renders are linear in the
-parameters.
+The scene after it is compared with the scene before it. It is kept if it gains in whole pictures of a middle size,
+lowers the error in at least half of the views, and harms no picture of another size.
 """
 
 from __future__ import annotations
 
-import functools
-import math
 from dataclasses import dataclass
 from enum import Enum, auto
-
-import torch
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.merging.finishing import top_of_parabola
 from pointsplat_ns.system.progress import Progress, silent
 
 
@@ -74,99 +66,24 @@ class Comparison:
         others = (sides[0], sides[-1], 4 * sides[-1])
         self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
 
-    def psnrs(self, scene: Gaussians) -> list[float]:
-        """PSNR of a scene in pictures of each other size, dB; empty where pictures have one size."""
-        return [] if self._others is None else self._others.psnrs(scene)
+    def judged(
+        self, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
+    ) -> tuple[Closeness, Reason | None]:
+        """Errors of a changed scene, and why it is left out; None if it is kept.
 
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """The accepted share of a refinement or repair."""
-
-    scene: Gaussians
-    """The scene after this share; the scene before, if no share is accepted."""
-    strength: float
-    """The share, in (0, 1]; 1 if none is accepted."""
-    closeness: Closeness
-    """Errors of ``scene``; of the whole change, if no share is accepted."""
-    reason: Reason | None
-    """Why no share is accepted; None if one is."""
-
-
-def accept_change(
-    judge: Comparison, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
-) -> Change:
-    """The share of a refinement or repair with the least error, of those that improve the scene.
-
-    Args:
-        judge: compares scenes with the dense scene.
-        before: errors of ``old``.
-        old, new: the scenes before and after.
-        progress: called with the name of the current task and the share of it that is done, in [0, 1].
-
-    Returns:
-        The accepted share; its scene is on the device of ``old``.
-    """
-    start, end = old.to(judge.device), new.to(judge.device)
-    tried: dict[float, Closeness] = {}
-
-    @functools.cache
-    def least() -> list[float]:
-        """Least PSNR in pictures of each other size, dB; rendered only for shares that pass the first check."""
-        return [psnr - ACCEPTANCE.most_loss for psnr in judge.psnrs(start)]
-
-    def attempt(strength: float) -> bool:
-        """Whether a share of the change passes all checks."""
-        done = len(tried)
-        scene = interpolate(start, end, strength)
-        tried[strength] = judge.reference.closeness(
-            scene, lambda share: progress("comparing renders", (done + share) / 3)
-        )
-        if _why_no_gain(before, tried[strength]) is not None:
-            return False
-        return all(psnr >= bound for bound, psnr in zip(least(), judge.psnrs(scene), strict=True))
-
-    accepted = [1.0] if attempt(1.0) else []
-    clear_gain = bool(accepted) and tried[1.0].psnr >= before.psnr + 0.5  # dB
-    if tried[1.0].errors != before.errors and not clear_gain:
-        accepted += [0.5] if attempt(0.5) else []
-        bottom = parabola_minimum(before.error, tried[0.5].error, tried[1.0].error)
-        if all(abs(bottom - share) > 0.05 for share in (0.0, 0.5, 1.0)):  # closer shares hardly differ
-            accepted += [bottom] if attempt(bottom) else []
-    progress("comparing renders", 1.0)
-    if not accepted:
-        return Change(old, 1.0, tried[1.0], _why_no_gain(before, tried[1.0]) or Reason.OTHER_SIZES)
-    strength = min(accepted, key=lambda share: tried[share].error)
-    return Change(interpolate(start, end, strength).to(old.device), strength, tried[strength], None)
-
-
-def interpolate(before: Gaussians, after: Gaussians, strength: float) -> Gaussians:
-    """Interpolate the stored parameters of two scenes linearly (scales as logarithms, opacities as logits).
-
-    Args:
-        before, after: N Gaussians each.
-        strength: weight of ``after``, in [0, 1].
-
-    Returns:
-        N Gaussians. A value whose interpolation is not finite stays as in ``before``.
-    """
-    if strength == 1:
-        return after
-    mixed = (a.lerp(b, strength) for a, b in zip(before.tensors(), after.tensors(), strict=True))
-    values = zip(before.items(), mixed, strict=True)
-    return before.replace(**{name: torch.where(value.isfinite(), value, a) for (name, a), value in values})
-
-
-def parabola_minimum(at_zero: float, at_half: float, at_one: float) -> float:
-    """Minimum in [0, 1] of the parabola through values at 0, 1/2 and 1; NaN if a value is not finite.
-
-    Example:
-        >>> round(parabola_minimum(0.3**2, 0.2**2, 0.7**2), 6)
-        0.3
-    """
-    if not all(map(math.isfinite, (at_zero, at_half, at_one))):
-        return math.nan
-    return top_of_parabola((0.0, 0.5, 1.0), [-at_zero, -at_half, -at_one], 0.0)
+        Args:
+            before: errors of ``old``.
+            old, new: the scenes before and after.
+            progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        """
+        end = new.to(self.device)
+        after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
+        reason = _why_no_gain(before, after)
+        if reason is None and self._others is not None:
+            least = (psnr - ACCEPTANCE.most_loss for psnr in self._others.psnrs(old.to(self.device)))
+            if not all(psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)):  # NaN too
+                reason = Reason.OTHER_SIZES
+        return after, reason
 
 
 def _why_no_gain(before: Closeness, after: Closeness) -> Reason | None:

@@ -8,7 +8,7 @@ import math
 import time
 from typing import Literal
 
-from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason, accept_change
+from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
 from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, Photos, photo_repair
@@ -90,9 +90,8 @@ def _refined(last: Stage, refiner: TrainedRefiner, judge: Comparison | None, pro
         return Stage("refine", refined, None, last.after, reason=Reason.NOT_FINITE)
     if judge is None or last.after is None:
         return Stage("refine", refined, None, reason=Reason.NOT_COMPARED)
-    change = accept_change(judge, last.after, last.scene, refined, progress)
-    scene = change.scene if change.reason is None else refined
-    return Stage("refine", scene, change.closeness, last.after, change.strength, change.reason)
+    after, reason = judge.judged(last.after, last.scene, refined, progress)
+    return Stage("refine", refined, after, last.after, reason)
 
 
 def _repaired(
@@ -103,10 +102,9 @@ def _repaired(
     progress("repairing", 0.0)
     report = functools.partial(progress, "repairing")
     repaired = repair(last.scene.to(dense.device), dense, views, budget, report, psnr=last.after.psnr)
-    change = accept_change(judge, last.after, last.scene, repaired.scene)
-    scene = change.scene if change.reason is None else repaired.scene.to(last.scene.device)
-    figures = (repaired.steps, repaired.seconds, repaired.interrupted)
-    return Stage("repair", scene, change.closeness, last.after, change.strength, change.reason, *figures)
+    after, reason = judge.judged(last.after, last.scene, repaired.scene)
+    scene, figures = repaired.scene.to(last.scene.device), (repaired.steps, repaired.seconds, repaired.interrupted)
+    return Stage("repair", scene, after, last.after, reason, *figures)
 
 
 def _trained(
@@ -126,7 +124,7 @@ def _trained(
     reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else Reason.SMALL_GAIN  # NaN too
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
-    return Stage("photos", scene, after, last.after, 1.0, reason, *figures, photos=trained)
+    return Stage("photos", scene, after, last.after, reason, *figures, photos=trained)
 
 
 def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | None) -> list[Stage]:

@@ -20,13 +20,11 @@ class Stage:
 
     name: Literal["merge", "prune", "refine", "repair", "photos", "round"]
     scene: Gaussians
-    """The scene after the share ``strength`` of the stage; after the whole stage, if it is left out."""
+    """The scene after the stage."""
     after: Closeness | None
     """Errors of ``scene`` against the dense scene's renders; None if it was not compared."""
     before: Closeness | None = None
     """Errors of the scene before the stage; None for pruning."""
-    strength: float = 1.0
-    """Share of the change in ``scene``, in (0, 1]."""
     reason: Reason | None = None
     """Why the stage is left out; None if it is kept."""
     steps: int = 0
@@ -91,13 +89,8 @@ class Compacted:
 
     @property
     def refined(self) -> Gaussians:
-        """The scene after refinement at ``strength``; ``pruned`` if there is no refiner."""
+        """The scene after refinement; ``pruned`` if there is no refiner."""
         return (self._stage("refine") or self.stages[0]).scene
-
-    @property
-    def strength(self) -> float:
-        """Accepted share of the refiner's residuals in ``refined``, in (0, 1]; 1 if none is accepted."""
-        return (self._stage("refine") or self.stages[0]).strength
 
     @property
     def accepted(self) -> bool:
@@ -180,8 +173,7 @@ def _line(stage: Stage, result: Compacted) -> str:
     cost = f" by {steps} in {stage.seconds:.1f} s" + (", interrupted" if stage.interrupted else "")
     cost = cost if stage.name == "repair" else ""
     if stage.reason is None:
-        share = "" if stage.strength == 1 else f", {stage.strength:.0%} of the change kept"
-        return f"{done}{cost}{share}: {figures}"
+        return f"{done}{cost}: {figures}"
     reasons = {
         Reason.NO_GAIN: "it does not help",
         Reason.SMALL_GAIN: f"it {_TOO_LITTLE}",

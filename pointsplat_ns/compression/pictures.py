@@ -74,8 +74,7 @@ def plot_comparison(
                 "photos": "trained",
                 "round": "rounded",
             }[stage.name]
-            share = f" at {stage.strength:.0%}" if stage.name == "refine" and stage.strength != 1 else ""
-            names.append(name + (share if stage.accepted else " (left out)"))
+            names.append(name if stage.accepted else f"{name} (left out)")
             last = stage is result.last
             said = [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))] if last else []
             titles.append(_title(names[-1], stage.scene, *said))
