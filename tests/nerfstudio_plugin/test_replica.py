@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.captures import dataparser_for
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig, fuse_depth
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth, read_photo
 from replica_scenes import CAMERA, line_of, write_scene
@@ -241,7 +240,6 @@ def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
     assert np.allclose(*both, atol=6e-4), "half a millimetre of rounding"
     assert np.array_equal(read_photo(theirs.photos[3], theirs.params), read_photo(ours.photos[3], ours.params))
     assert len(parse(sequence).image_filenames) == 10 and len(parse(sequence, "test").image_filenames) == 2
-    assert isinstance(dataparser_for(sequence), ReplicaDataParserConfig)
     with pytest.raises(DataError, match="it contains the scenes Sequence_1: name one of them"):
         load_replica(sequence.parent)
     (sequence / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
