@@ -1,4 +1,4 @@
-"""Commands of nerfstudio that the lab runs."""
+"""Runs in the tables: their photos, and what they differ in from the paper."""
 
 import json
 from pathlib import Path
@@ -9,26 +9,9 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.compare import dataset_photos
-from lab.common.running import has_finished, remove_interrupted
 from lab.tables import layout, scenes
 from lab.tables.measure import measure_tables
 from lab.tables.scenes import differences, paper_dataset
-from making import write_run
-from pointsplat_ns.errors import SceneError
-
-
-def files(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpoint_has_not_finished(tmp_path):
-    checkpoint = write_run(tmp_path, 30, 30)
-    with pytest.raises(SceneError, match="a finished training of 30 steps; expected one of 20 or none"):
-        has_finished(tmp_path, 20)
-    checkpoint.unlink()
-    assert not has_finished(tmp_path, 30) and (tmp_path / "config.yml").is_file()
-    assert not has_finished(tmp_path / "nothing", 30)
-    remove_interrupted(tmp_path / "nothing")
 
 
 def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
@@ -61,17 +44,6 @@ def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames
 
 def run(data: Path, parser: str) -> SimpleNamespace:
     return SimpleNamespace(data=data, dataparser_class=parser)
-
-
-def test_only_an_interrupted_training_is_removed(tmp_path):
-    done, stopped = tmp_path / "done", tmp_path / "stopped"
-    write_run(done, 30, 30)
-    write_run(stopped, 12, 30)
-    remove_interrupted(stopped)
-    assert not stopped.exists()
-    with pytest.raises(SceneError, match="holds a finished training"):
-        remove_interrupted(done)
-    assert len(files(done)) == 2
 
 
 def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path):
