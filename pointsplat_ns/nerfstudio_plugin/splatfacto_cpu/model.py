@@ -40,7 +40,7 @@ class LpipsMetric:
     """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
 
     def __init__(self) -> None:
-        self._lpips = ReportedLpips("alex")
+        self._lpips = ReportedLpips()
 
     @property
     def reason(self) -> str | None:
