@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from nerfstudio.data.datamanagers.base_datamanager import DataManager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -17,7 +18,6 @@ from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
-from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
@@ -67,7 +67,7 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     images_on_gpu: Suppress[Fixed[bool]] = False
 
 
-class ScenesDataManager(SpiralSource):
+class ScenesDataManager(DataManager):
     """Hands out, at each step, one scene and some of its training photos.
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
