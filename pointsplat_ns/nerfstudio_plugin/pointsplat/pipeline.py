@@ -160,8 +160,7 @@ class PointSplatPipeline(VanillaPipeline):
             ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant); and ``scenes``. Values that
             cannot be computed are None, and ``lpips_note`` says why LPIPS is missing. ``reference``, here and in each
             scene, says what renders were compared with: ``photos``, or ``dense renders`` if a scene has no photos (its
-            dense variant then has no PSNR). If there are scenes of both kinds, the values above are those of scenes
-            with photos, and ``against_dense_renders`` holds those of the others.
+            dense variant then has no PSNR). Means are over the scenes with photos if there are any.
         """
         training = self.training
         self.eval()

@@ -16,7 +16,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D, Views
 
@@ -35,8 +35,8 @@ def rooms(tmp_path_factory) -> Path:
     return folder
 
 
-def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> PlyScene:
-    return PlyScene("one", rooms / "one.ply", MemoryCache(cache_bytes), POSES)
+def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> DenseScene:
+    return DenseScene("one", rooms / "one.ply", MemoryCache(cache_bytes), POSES)
 
 
 def manager_of(folder: Path, **settings):
