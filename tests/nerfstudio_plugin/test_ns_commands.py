@@ -227,7 +227,8 @@ def test_interpolate_draws_between_the_photos(run: Run, tmp_path):
     assert np.abs(pictures[0] - pictures[6]).mean() > 0.02
 
 
-def test_dataset_puts_the_undistorted_photo_beside_each_render(run: Run, tmp_path):
+def test_dataset_puts_the_undistorted_photo_beside_each_render(trained_by_ns_train, tmp_path):
+    run = trained_by_ns_train("splatfacto-cpu")
     words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
     started(render, "dataset", *words, "--split", "train+test", "--rendered-output-names", "rgb", "gt-rgb", "depth")
     _, pipeline, _, _ = eval_setup(run.config, test_mode="test")

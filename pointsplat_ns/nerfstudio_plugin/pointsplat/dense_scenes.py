@@ -15,12 +15,10 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
@@ -151,7 +149,7 @@ class DenseScene:
 
 class RenderedDataset:
     """Renders of a dense scene from the cameras of a split, with the part of a dataset's interface that nerfstudio's
-    viewer and ``ns-render`` use."""
+    viewer uses."""
 
     def __init__(self, scene: DenseScene, split: Split):
         self._scene, self._split = scene, split
@@ -160,12 +158,6 @@ class RenderedDataset:
     def cameras(self) -> Cameras:
         """The cameras, found when they are first needed."""
         return self._scene.cameras(self._split)
-
-    @property
-    def _dataparser_outputs(self) -> DataparserOutputs:
-        # There are no files: ``ns-render dataset`` names its own after these.
-        names = [Path(f"{index:05d}.png") for index in range(len(self))]
-        return DataparserOutputs(image_filenames=names, cameras=self.cameras)
 
     def __bool__(self) -> bool:
         return True  # of no scene are there no poses; nerfstudio asks before they have to be found
@@ -180,8 +172,3 @@ class RenderedDataset:
             "image": (255 * image).round().to(torch.uint8) if image_type == "uint8" else image,
             "image_idx": image_idx,
         }
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
-        _, data = frames[index]  # from the cache
-        return {**data, "image": in_unit_range(data["image"])}
