@@ -156,8 +156,7 @@ class StoppableTrainer(Trainer):
         with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
             _, losses, metrics = pipeline.get_train_loss_dict(step=step)
             loss = functools.reduce(torch.add, losses.values())
-        own: dict[str, Tensor] = metrics.pop("own_losses", losses)
-        faults = [f"the loss {name} is {value.item():g}" for name, value in own.items() if not value.isfinite()]
+        faults = [f"the loss {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
         skip = processes.any_rank(bool(faults), self.device)
         if not skip:
             self.grad_scaler.scale(loss).backward()

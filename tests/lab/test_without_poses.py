@@ -80,27 +80,6 @@ def test_photos_of_a_colmap_model_become_pinhole_pictures(tmp_path):
     assert len(points) == len(bent.seeds)
 
 
-def test_seed_points_lie_on_the_wall_that_photos_show():
-    rng = np.random.default_rng(0)
-    wall = cv2.GaussianBlur(rng.uniform(0, 255, (300, 500, 3)), (0, 0), 2)
-    wall = np.clip(5 * (wall - wall.mean()) + 128, 0, 255).astype(np.uint8)
-    focal, depth, step = 200.0, 4.0, 0.3  # a step is 15 pixels
-    frames, pictures = [], []
-    for number in range(3):
-        pose = np.eye(4)
-        pose[0, 3] = number * step
-        frames.append({"transform_matrix": pose.tolist(), "fl_x": focal, "fl_y": focal, "cx": 160.0, "cy": 120.0})
-        left = round(number * step * focal / depth)
-        pictures.append(wall[:240, left : left + 320])
-    points, colours = captures.seed_points(pictures, frames)
-    assert len(points) == len(colours) > 200
-    assert np.abs(points[:, 2] + depth).max() < 0.5  # OpenGL: the camera looks along -z; 1.5 pixels of 15
-    pixels = np.floor(np.c_[160 + focal * points[:, 0] / depth, 120 - focal * points[:, 1] / depth]).astype(int)
-    inside = (pixels >= 0).all(1) & (pixels < [500, 240]).all(1)
-    near = wall[pixels[inside, 1], pixels[inside, 0], ::-1].astype(float)
-    assert np.abs(near - colours[inside]).mean() < 20
-
-
 def test_a_clone_of_another_repository_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"owner/name"):
         captures.prepare(KNOWN, tmp_path, tmp_path / "ready", 960)

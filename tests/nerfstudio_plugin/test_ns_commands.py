@@ -135,7 +135,8 @@ def test_training_serves_what_the_model_draws_and_logs_every_loss(run: Run):
     assert all(np.isfinite(event.value) for event in losses)
 
 
-def test_both_options_go_on_from_the_checkpoint_alike(run: Run, tmp_path):
+def test_both_options_go_on_from_the_checkpoint_alike(trained_by_ns_train, tmp_path):
+    run = trained_by_ns_train("splatfacto-cpu")
     states = []
     for option, value in (("--load-dir", run.checkpoint.parent), ("--load-checkpoint", run.checkpoint)):
         words = list(run.words)
