@@ -148,25 +148,26 @@ def _means(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 def print_summary(summary: dict[str, Any]) -> None:
     """Print the results of ``ns-eval``: a table, and the reason if LPIPS is missing."""
     settings = summary["settings"]
-    blocks = [
-        (name, "yes" if scene["seen_in_training"] else "never", scene["reference"], scene)
-        for name, scene in summary["scenes"].items()
-    ]
+    scenes, reference = summary["scenes"], summary["reference"]
+    blocks = [(name, "yes" if scene["seen_in_training"] else "never", scene) for name, scene in scenes.items()]
     if len(blocks) > 1:
         means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-        blocks += [("average", seen, summary["reference"], summary[key]) for seen, key in means if key in summary]
+        blocks += [("average", seen, summary[key]) for seen, key in means if key in summary]
     rows = [
         (
-            *(about if variant == VARIANTS[0] else ("", "", "")),
+            *((name, seen) if variant == VARIANTS[0] else ("", "")),
             variant,
             *("-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}" for key, _, digits in COLUMNS),
         )
-        for *about, scene in blocks
+        for name, seen, scene in blocks
         for variant in VARIANTS
     ]
-    header = ("scene", "seen in training", "compared with", "variant", *(title for _, title, _ in COLUMNS))
-    title = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
-    print_table(header, rows, title=title, left=(0, 1, 2, 3), section=len(VARIANTS))
+    header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
+    made = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
+    print_table(header, rows, title=f"{made}; compared with {reference}", left=(0, 1, 2), section=len(VARIANTS))
+    others = [name for name, scene in scenes.items() if scene["reference"] != reference]
+    if others:
+        print(f"compared with {REFERENCES[False]}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
         print(f"no LPIPS: {summary['lpips_note']}")
 

@@ -32,10 +32,11 @@ def test_the_table_shows_each_scene_and_mean_by_what_it_is_compared_with(capsys)
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in shown.splitlines() if "dense  " in line]
     figures = ["dense", "30.00", "0.900", "-", "1,000", "0.24", "12.0"]
     assert rows == [
-        ["a", "yes", "photos", *figures],
-        ["b", "never", "photos", *figures],
-        ["c", "never", "dense renders", "dense", "-", *figures[2:]],
-        *(["average", seen, "photos", *figures] for seen in ("", "yes", "never")),
+        ["a", "yes", *figures],
+        ["b", "never", *figures],
+        ["c", "never", "dense", "-", *figures[2:]],
+        *(["average", seen, *figures] for seen in ("", "yes", "never")),
     ]
-    assert "keep 0.1, by paper, refiner tiny" in shown
+    assert "keep 0.1, by paper, refiner tiny; compared with photos" in shown
+    assert "compared with dense renders, and in no mean: c\n" in shown
     assert shown.endswith("no LPIPS: no weights here\n")
