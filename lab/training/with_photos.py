@@ -63,13 +63,13 @@ PAGE = f"""# With the photos at hand
 `lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants
 of `{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
 
-- PSNR and LPIPS are means over all held-out photos, at the size of the photos of the training.
-- "s" are CPU seconds of a process on one thread, with starting, reading and writing. All ways but the cap need the
-  dense training as well. The machine was busy: equal work differs by up to a half.
+- PSNR and LPIPS are means over all held-out photos.
+- "s" are CPU seconds of a process on one thread. All ways but the cap need the dense training as well. The machine was
+  busy: equal work differs by up to a half.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" takes
   `--seconds` of the CPU seconds of the dense training: about half as many CPU seconds.
-- "{SCORES["lightgaussian"]}" keeps the Gaussians with the highest scores and trains them as `{COMPACTED}` does,
-  for as many CPU seconds. The method's own schedule is longer.
+- "{SCORES["lightgaussian"]}" trains the Gaussians with the highest scores as `{COMPACTED}` does, for as many CPU
+  seconds. The method's own schedule is longer.
 - "cap" is a training with a limit of Gaussians, by 3DGS-MCMC's densification, that the package had. "{CAP_SHORT}" took
   about the CPU seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - "-" was not measured.
