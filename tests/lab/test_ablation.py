@@ -26,13 +26,6 @@ def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
         assert any(known[field] != value for field, value in found.items()), name
 
 
-def test_settings_of_looking_are_in_force_for_their_variant_alone():
-    before = LOOKING.candidates_per_view
-    with ablation.applied({"candidates_per_view": 3, "neighbours": 2}) as settings:
-        assert LOOKING.candidates_per_view == 3 and settings == dataclasses.replace(MERGING, neighbours=2)
-    assert LOOKING.candidates_per_view == before
-
-
 def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
     results = tmp_path / "rows.json"
     ablation.main((small,), keep=(0.2,), variants=TWO, views=2, width=64, json_path=results)

@@ -13,7 +13,7 @@ CHECKS = (
 )  # fmt: skip
 
 
-def test_every_check_passes_where_both_devices_are_the_cpu(capsys):
+def test_every_check_passes_where_both_devices_are_the_cpu(coarse_rooms, capsys):
     with pytest.raises(SystemExit) as ended:
         cuda.main(device="cpu", steps=4, every=80, resolution=(96, 64))
     lines = capsys.readouterr().out.splitlines()

@@ -55,25 +55,20 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
     assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
 
 
-def test_scannetpp_is_known_by_the_names_of_its_scenes(tmp_path):
-    for name in ("0a5c013435", "fox"):
-        (tmp_path / name / "dslr").mkdir(parents=True)
-    assert paper_dataset(run(tmp_path / "0a5c013435", SCANNETPP)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "fox", SCANNETPP)) == ""
-    assert paper_dataset(run(tmp_path / "0a5c013436", SCANNETPP)) == ""
-    assert paper_dataset(run(tmp_path / "0a5c013435", "nerfstudio.NerfstudioDataParserConfig")) == ""
-
-
-def test_scannetpp_is_known_by_its_colmap_model_as_the_authors_read_it(tmp_path):
-    colmap = "nerfstudio.data.dataparsers.colmap_dataparser.ColmapDataParserConfig"
-    for name in ("0a5c013435", "fox"):
-        (tmp_path / name / "dslr" / "colmap").mkdir(parents=True)
-    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr" / "colmap", colmap)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr", colmap)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "fox" / "dslr", colmap)) == ""
-
-
-SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParserConfig"
+@pytest.mark.parametrize(
+    ("scene", "below", "parser", "dataset"),
+    [
+        ("0a5c013435", "", "scannetpp_dataparser.ScanNetppDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "dslr", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "dslr/colmap", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "", "nerfstudio_dataparser.NerfstudioDataParserConfig", ""),
+        ("fox", "", "scannetpp_dataparser.ScanNetppDataParserConfig", ""),
+        ("fox", "dslr", "colmap_dataparser.ColmapDataParserConfig", ""),
+    ],
+)
+def test_scannetpp_is_known_by_the_names_of_its_scenes(scene, below, parser, dataset, tmp_path):
+    (tmp_path / scene / "dslr" / "colmap").mkdir(parents=True)
+    assert paper_dataset(run(tmp_path / scene / below, f"nerfstudio.data.dataparsers.{parser}")) == dataset
 
 
 @pytest.mark.parametrize(

@@ -97,17 +97,6 @@ def test_a_mean_of_photos_needs_photos_of_all_scenes():
     assert "PSNR" not in alone.header and rows_of(alone)["10 %", "merge (our default)"][3] == f"splat {psnr}"
 
 
-@pytest.mark.parametrize(
-    "datasets, expected",
-    [(("Replica",) * 2, "Replica"), (("Replica", ""), ""), (("", ""), ""), (("nuScenes",) * 2, "")],
-)
-def test_a_group_is_of_a_dataset_if_all_its_scenes_are(datasets, expected):
-    tables = Tables()
-    for number, dataset in enumerate(datasets):
-        add_scene(tables, f"room{number}", "Replica", dataset)
-    assert tables.dataset(["room0", "room1"]) == expected
-
-
 def test_names_cannot_leave_their_cells_nor_start_commands():
     name = "a|b\n\\input{/etc/passwd} % $x^2$ ~ &"
     table = Table(1, name, (name, "b"), [(name, "c")], [name])

@@ -48,9 +48,3 @@ def test_a_program_that_writes_nothing_is_an_error(tmp_path):
     reducer = Reducer("idle", lambda source, count, target: [sys.executable, "-I", "-S", "-c", "pass"])
     with pytest.raises(ProgramFailed, match="wrote no file"):
         reducer.reduce(tmp_path / "room.ply", 10)
-
-
-@pytest.mark.parametrize("says", ["", "no version", "vx.y", "v" + "9" * 5000])
-def test_what_is_no_version_is_none(peer, says):
-    found = SplatTransform(peer(says))
-    assert found.modes == () and "ended with 0; is Node's package installed?" in found.missing
