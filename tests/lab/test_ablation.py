@@ -43,21 +43,6 @@ def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(smal
     assert all(name in said for name in TWO) and "| 20 % |" in said
 
 
-def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, monkeypatch):
-    [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    given, results = [], tmp_path / "rows.json"
-
-    def recorded(scene, k, *, views, settings):
-        given.append(views)
-        return merge(scene, k, views=views, settings=settings)
-
-    ablation.warm_up()
-    monkeypatch.setattr(ablation, "merge", recorded)
-    ablation.main((run,), keep=(0.5,), variants=("no_regrouping",), views=2, json_path=results)
-    assert [row["at"] for row in rows_of(results)] == ["photos"] * 2 + ["photos, poses given"] * 2
-    assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
-
-
 @pytest.mark.usefixtures("usual_looking")
 def test_the_record_that_is_committed_has_the_page_of_its_rows():
     rows, settings = record.read([record.FOLDER / "ablation.json"], "ablation.py")

@@ -107,23 +107,6 @@ def test_every_way_and_set_of_views_has_a_row(measured):
         assert row["psnr"] == pytest.approx(expected["covered_psnr"], abs=1e-9)
 
 
-def test_a_row_that_is_there_is_measured_again_only_if_asked(measured, tmp_path, monkeypatch, capsys):
-    run, results = measured
-    copied = tmp_path / "rows.json"
-    copied.write_text(results.read_text())
-    asked = []
-    monkeypatch.setattr(
-        without_poses, "_made", lambda ply, count, way, views: asked.append((way, views)) or ps.load(ply)
-    )
-    options = {"keep": (0.5,), "views": 2, "json_path": copied, "resume": True}
-    without_poses.main((run,), **options)
-    assert asked == [] and json.loads(copied.read_text()) == json.loads(results.read_text())
-    without_poses.main((run,), **options, again=("sampled",))
-    assert asked == [("prune", None), ("compact", None)]
-    said = " ".join(capsys.readouterr().out.split())
-    assert "mean" in said and "worst" in said
-
-
 def test_a_ply_is_refused_as_it_has_no_held_out_poses(tmp_path):
     write_ply(box_room(seed=3), tmp_path / "room.ply")
     with pytest.raises(SceneError, match="expected a run"):
