@@ -204,7 +204,7 @@ def rename_photos(scene: Path) -> None:
         (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),
         (
             lambda scene: (scene / "dslr/resized_images/00001.png").unlink(),
-            "1 of 7 .* missing, first 00001.png.*--images-dir",
+            "1 of 7 .* missing, first 00001.png",
         ),
         (lambda scene: (scene / TRANSFORMS).write_text("{}"), "KeyError: 'frames'; expected JSON with frames"),
         (lambda scene: (scene / TRANSFORMS).write_text("{"), "transforms.json: JSONDecodeError"),
