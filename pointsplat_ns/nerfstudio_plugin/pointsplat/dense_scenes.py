@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.ply import read_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
@@ -172,3 +173,8 @@ class RenderedDataset:
             "image": (255 * image).round().to(torch.uint8) if image_type == "uint8" else image,
             "image_idx": image_idx,
         }
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
+        _, data = frames[index]  # from the cache
+        return {**data, "image": in_unit_range(data["image"])}
