@@ -36,20 +36,12 @@ from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
 
-class LpipsMetric:
-    """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
-
-    def __init__(self) -> None:
-        self._lpips = ReportedLpips()
-
-    @property
-    def reason(self) -> str | None:
-        """Why LPIPS could not be computed; None if it could, so far."""
-        return self._lpips.reason
+class LpipsMetric(ReportedLpips):
+    """LPIPS, called like nerfstudio's metrics."""
 
     def __call__(self, image: Tensor, other: Tensor) -> Tensor:
         """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, if it cannot be computed."""
-        value = self._lpips(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
+        value = super().__call__(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
         return image.new_tensor(math.nan) if value is None else value.mean()
 
 
