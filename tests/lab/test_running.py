@@ -95,5 +95,6 @@ def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, dif
         datamanager_fields={"camera_res_scale_factor": case["scale"]},
         dataparser_fields={"downscale_factor": case["downscale"]},
     )
-    monkeypatch.setattr(scenes, "dataset_facts", lambda *_: (3, case["masks"]))
+    photo = SimpleNamespace(mask=torch.ones(1) if case["masks"] else None)
+    monkeypatch.setattr(scenes, "run_photos", lambda *_: [photo] * 3)
     assert differences(known, case["sh_degree"], case["seen"], (case["side"], 64)) == differs

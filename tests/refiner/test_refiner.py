@@ -5,7 +5,7 @@ import torch
 
 from making import same, scene_to_refine, small_refiner
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner
 
 
@@ -118,15 +118,6 @@ def test_a_float64_network_equals_the_float32_one_within_rounding():
     for (key, a), b in zip(single.items(), double.tensors(), strict=True):
         assert a.dtype == torch.float64
         assert torch.allclose(a, b, atol=1e-4), key  # a dozen layers of sums of up to 500 terms in float32
-
-
-def test_parameter_groups_hold_every_parameter_once():
-    refiner = small_refiner()
-    groups = refiner.parameter_groups()
-    assert set(groups) == {"encoder", "backbone", *PARAMETERS}
-    ids = [id(p) for group in groups.values() for p in group]
-    assert sorted(ids) == sorted(id(p) for p in refiner.parameters())
-    assert "encoder" not in small_refiner(encoder="concat").parameter_groups()
 
 
 def test_a_scene_of_a_higher_degree_than_the_network_is_refused():
