@@ -51,8 +51,8 @@ def written(tmp_path_factory, coarser_light):
         )
 
 
-def picture(room, pose, **options):
-    return render_room(room, pose, default_intrinsics(WIDTH, HEIGHT), WIDTH, HEIGHT, **options)
+def picture(room, pose):
+    return render_room(room, pose, default_intrinsics(WIDTH, HEIGHT), WIDTH, HEIGHT)
 
 
 def test_a_seed_gives_the_same_room_path_and_picture_and_another_seed_another(room, poses):
