@@ -69,7 +69,7 @@ RUNS = {
 """Commands that nothing is missing for, and what they print."""
 
 FAILS = {
-    "train capture": "training a scene needs nerfstudio, which is not installed; "
+    "compact run --photos": "reading the photos and poses of a run needs nerfstudio, which is not installed; "
     "pip install 'pointsplat-ns[nerfstudio]' adds it",
 }
 """Commands that something is missing for, and what they say."""

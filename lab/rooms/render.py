@@ -22,7 +22,6 @@ def render_room(
     K: Tensor,  # [3, 3]
     width: int,
     height: int,
-    highlights: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """A photo of a room, by ray casting with 2 x 2 rays a pixel.
 
@@ -32,7 +31,6 @@ def render_room(
         K: intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
         width: of the image, pixels.
         height: of the image, pixels.
-        highlights: False leaves out all that depends on the viewer (for tests and comparison).
 
     Returns:
         rgb (H, W, 3) in [0, 1], sRGB-like (gamma 2.2), and depth (H, W) along the optical axis in
@@ -50,7 +48,7 @@ def render_room(
     eye, rotation = c2w[:3, 3:], c2w[:3, :3]
     with one_thread(), torch.no_grad():
         fine, rows = _camera_rays(K, width, height, 2), max((1 << 14) // width, 1)
-        bands = [_shaded(room, eye, rotation @ rays, K, highlights) for rays in fine.split(rows * width, 1)]
+        bands = [_shaded(room, eye, rotation @ rays, K) for rays in fine.split(rows * width, 1)]
         display = 1.0 - torch.exp(torch.cat(bands) * (-1.6 * room.baked.exposure))
         rgb = display.view(height, 2, width, 2, 3).mean(dim=(1, 3)).clamp(0, 1) ** (1 / 2.2)
         rays = _camera_rays(K, width, height, 1)
@@ -65,7 +63,7 @@ def _camera_rays(K: Tensor, width: int, height: int, side: int) -> Tensor:
     return torch.stack([u, v, torch.ones_like(u)]).flatten(1)
 
 
-def _shaded(room: Room, eye: Tensor, ways: Tensor, K: Tensor, highlights: bool) -> Tensor:
+def _shaded(room: Room, eye: Tensor, ways: Tensor, K: Tensor) -> Tensor:
     """Radiance (M, 3) along rays from a camera: texture times baked light, plus what shines, plus highlights."""
     baked = room.baked
     z, index = trace(room.solids, eye, ways)
@@ -80,7 +78,7 @@ def _shaded(room: Room, eye: Tensor, ways: Tensor, K: Tensor, highlights: bool) 
     emission, gloss = baked.emission[hits.chart, None], baked.gloss[hits.chart]
     # What shines is shown as painted, whatever the room's exposure.
     radiance = color * torch.where(emission > 0, emission / baked.exposure, light[:, :3])
-    for number, source in enumerate(room.lights if highlights else ()):
+    for number, source in enumerate(room.lights):
         seen = light[:, 3 + number] * gloss
         part = (seen > 1e-3).nonzero()[:, 0]
         shininess = baked.shininess[hits.chart[part]]

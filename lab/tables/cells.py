@@ -12,7 +12,7 @@ from lab.common.results import Row, write_json
 from lab.tables.ways import PROTOCOL, published
 from pointsplat_ns.errors import SceneError
 
-FILES = ("tables.json", "tables.md", "tables.tex", "figure4.png")
+FILES = ("tables.json", "tables.md", "figure4.png")
 """Files in a folder of tables; the first has all cells."""
 
 FORMAT = {"format": "pointsplat-tables", "version": 1}

@@ -1,4 +1,4 @@
-"""All cells of a folder, arranged as the paper's tables, in Markdown and in LaTeX."""
+"""All cells of a folder, arranged as the paper's tables, in Markdown."""
 
 from __future__ import annotations
 
@@ -244,13 +244,6 @@ def markdown_table(table: Table) -> str:
     return "\n\n".join([f"**{name}{escaped(table.title)}**", markdown(header, rows), *([notes] if notes else [])])
 
 
-def latex_table(table: Table) -> str:
-    """A table in LaTeX with the package ``booktabs``; title and notes are comments."""
-    frame = pd.DataFrame([[" ".join(text.split()) for text in row] for row in table.rows], columns=list(table.header))
-    about = [f"% {' '.join(text.split())}" for text in (f"Table {table.number}. {table.title}", *table.notes)]
-    return "\n".join([*about, frame.to_latex(index=False, escape=True)])
-
-
 def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
     """Write all files, if anything was measured. ``keeps`` are the shares of Table 1, for rows without
     measurements."""
@@ -261,10 +254,7 @@ def write_tables(tables: Tables, folder: Path, keeps: Sequence[float]) -> None:
     made = {group: Layout(tables, group, names, keeps).tables() for group, names in groups.items()}
     with replacing(folder / FILES[1], named=False) as part:
         part.write_text(_markdown(tables, made), encoding="utf-8")
-    with replacing(folder / FILES[2], named=False) as part:
-        every = [latex_table(table) for members in made.values() for table in members]
-        part.write_text("\n".join([r"% needs \usepackage{booktabs}", *every]), encoding="utf-8")
-    plot_figure(tables.cells, groups, folder / FILES[3])
+    plot_figure(tables.cells, groups, folder / FILES[2])
 
 
 def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
@@ -283,5 +273,5 @@ def _markdown(tables: Tables, made_tables: dict[str, list[Table]]) -> str:
             parts_of_paper = "The paper does not say of which scenes its Table 2 and Figure 4 are; its LPIPS is by VGG."
             parts.append(parts_of_paper)
         parts += [f"## {escaped(group)}", markdown(heads, lines), *map(markdown_table, made_tables[group])]
-    parts += [f"![Figure 4]({FILES[3]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
+    parts += [f"![Figure 4]({FILES[2]})", "*Figure 4: opacity and volume of the Gaussians kept.*"]
     return "\n\n".join(part.strip() for part in parts) + "\n"

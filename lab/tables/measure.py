@@ -124,7 +124,7 @@ def measure_tables(
     Args:
         scenes: Splatfacto runs (folders or config.yml), whose held-out photos are then used where they are found; or
             files of scenes.
-        output: folder for tables.json with all cells, tables.md, tables.tex and figure4.png.
+        output: folder for tables.json with all cells, tables.md and figure4.png.
         keeps: shares of the Gaussians in Tables 1 and 2.
         refiners: weights for the rows with a network: runs, .safetensors files, or folders above runs. Each row takes
             those with fitting metadata; of those that differ by their seed, the mean.
@@ -161,7 +161,7 @@ def measure_tables(
                 _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
         finally:
             write_tables(tables, output, keeps)
-    print(f"{output}: tables.md, tables.tex, tables.json and figure4.png")
+    print(f"{output}: tables.md, tables.json and figure4.png")
     return tables
 
 

@@ -8,6 +8,7 @@ The same command resumes: finished networks are left alone, an interrupted one g
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from lab.common.printing import start
-from lab.common.running import folder_of_run, remove_interrupted, run, train_refiner_command
+from lab.common.running import folder_of_run, run, train_refiner_command
 from lab.tables.ways import PROTOCOL, WAYS, Way
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.runs import METHOD_NAMES, RUN_FILES, open_run
@@ -120,7 +121,7 @@ def main(
             left = max(1, left - open_run(folder, need_data=False).step - 1)
             needs |= {"load-dir": folder / "nerfstudio_models"}
         except SceneError:  # no checkpoint yet
-            remove_interrupted(folder)
+            shutil.rmtree(folder, ignore_errors=True)
         needs |= {"machine.seed": job.seed} | ({} if seconds is None else {"seconds": seconds})
         print(f"{number} of {len(own)}: {job.name}", flush=True)
         command = train_refiner_command(scenes, output, job.name, left, "run", held_out, needs, chosen.method)

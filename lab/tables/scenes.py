@@ -17,7 +17,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.runs import Run, may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_facts
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.views import Views
@@ -121,9 +121,9 @@ def differences(run: Run, sh_degree: int, seen: int, widths: tuple[int, int]) ->
         widths: of these, and of the photos as nerfstudio gives them, pixels.
     """
     found = []
-    every, masked = dataset_facts(run.folder, "test", run.data)
-    if seen < every:
-        found.append(f"{seen} of {every} held-out photos")
+    photos = run_photos(run.folder, "test", run.data)
+    if seen < len(photos):
+        found.append(f"{seen} of {len(photos)} held-out photos")
     scale = run.datamanager_fields.get("camera_res_scale_factor", 1.0)
     scale /= run.dataparser_fields.get("downscale_factor") or 1
     if widths[0] < widths[1]:
@@ -134,7 +134,7 @@ def differences(run: Run, sh_degree: int, seen: int, widths: tuple[int, int]) ->
         found.append(f"SH degree {sh_degree}")
     if run.step + 1 < PROTOCOL.dense_steps:
         found.append(f"{run.step + 1:,} of {PROTOCOL.dense_steps:,} Splatfacto steps")
-    if masked:
+    if photos[0].mask is not None:
         found.append("masks are not applied")
     return tuple(found)
 

@@ -6,10 +6,9 @@
 
 A dense scene is trained by ``ns-train splatfacto-cpu``, and made smaller by each way. The results are compared with the
 held-out photos, at the size of the photos. Each way is a process of its own, whose CPU seconds count, with starting and
-reading. ``compact --photos`` says how many seconds the others get: training on photos after pruning by a score takes as
-long; so does a training with a cap from the start, and a second one takes as long as the dense training besides. A long
-``compact --photos`` trains on photos for as many seconds of the clock as the dense training took of the processor.
-Finished rows are not measured again.
+reading. Training on photos after pruning by a score takes as long as ``compact --photos``. A long ``compact --photos``
+trains on photos for as many seconds of the clock as the dense training took of the processor. Finished rows are not
+measured again.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.rasterizer import render
 
 DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, short", "cap, long"
-"""Names of the dense scene and of trainings with a cap: without and with the seconds of the dense training."""
+"""Names of the dense scene, and of rows that the record has of a method that is gone."""
 
 COMPACTED, COMPACTED_LONG = "compact --photos", "compact --photos, long"
 """The way that says how many seconds the others get; and the same with as many seconds as the dense training took."""
@@ -62,17 +61,17 @@ METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
 PAGE = f"""# With the photos at hand
 
 `lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants
-of `{COMPACTED}` and of the training with a cap are chosen on fox, kitchen and vr_project. The others judge.
+of `{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
 
-- PSNR and LPIPS are means over all held-out photos, at the size of the photos of the training.
-- "s" are CPU seconds of a process on one thread, with starting, reading and writing. All ways but the cap need the
-  dense training as well. The machine was busy: equal work differs by up to a half.
+- PSNR and LPIPS are means over all held-out photos.
+- "s" are CPU seconds of a process on one thread. All ways but the cap need the dense training as well. The machine was
+  busy: equal work differs by up to a half.
 - `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" takes
   `--seconds` of the CPU seconds of the dense training: about half as many CPU seconds.
-- "{SCORES["lightgaussian"]}" keeps the Gaussians with the highest scores and trains them as `{COMPACTED}` does,
-  for as many CPU seconds. The method's own schedule is longer.
-- "cap" is `ns-train splatfacto-cpu --pipeline.model.max-gs-num`. "{CAP_SHORT}" takes about the CPU seconds of
-  `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
+- "{SCORES["lightgaussian"]}" trains the Gaussians with the highest scores as `{COMPACTED}` does, for as many CPU
+  seconds. The method's own schedule is longer.
+- "cap" is a training with a limit of Gaussians, by 3DGS-MCMC's densification, that the package had. "{CAP_SHORT}" took
+  about the CPU seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
 - "-" was not measured.
 """
 
@@ -103,27 +102,13 @@ class Capture:
         """The run of the dense training."""
         return folder_of_run(self.folder, self.name, METHOD_NAMES.scene, "dense")
 
-    def train(self, label: str, steps: int, cap: int | None = None) -> tuple[Path, float]:
-        """A new training, with a cap or without: its run and its CPU seconds."""
-        run = folder_of_run(self.folder, self.name, METHOD_NAMES.scene, label)
-        shutil.rmtree(run, ignore_errors=True)
+    def train(self) -> tuple[Path, float]:
+        """A new dense training: its run and its CPU seconds."""
+        shutil.rmtree(self.dense, ignore_errors=True)
         words = [*_TRAIN, self.arguments[0], "--output-dir", str(self.folder), "--experiment-name", self.name]
-        words += ["--timestamp", label, "--max-num-iterations", str(steps), "--vis", "tensorboard"]
-        words += ["--steps-per-eval-image", "0", "--steps-per-save", str(steps)]
-        words += [] if cap is None else ["--pipeline.model.max-gs-num", str(cap)]
-        return run, _cpu_seconds([*words, *self.arguments[1:]])
-
-    def capped(self, count: int, seconds: float, per_step: float, starting: float) -> tuple[Path, float]:
-        """A training with a cap of about so many CPU seconds, given those of a step and of the start."""
-        steps = max(1, round((seconds - starting) / per_step))
-        return self.train(f"cap-{count}-{steps}", steps, count)
-
-    def step_cost(self, count: int) -> tuple[float, float]:
-        """CPU seconds of a step of a training with a cap, on average over its schedule, and of the start."""
-        few, many = 1, max(20, self.steps // 10)
-        costs = [self.train("trial", steps, count)[1] for steps in (few, many)]
-        shutil.rmtree(folder_of_run(self.folder, self.name, METHOD_NAMES.scene, "trial"), ignore_errors=True)
-        return max(1e-3, (costs[1] - costs[0]) / (many - few)), costs[0]
+        words += ["--timestamp", "dense", "--max-num-iterations", str(self.steps), "--vis", "tensorboard"]
+        words += ["--steps-per-eval-image", "0", "--steps-per-save", str(self.steps)]
+        return self.dense, _cpu_seconds([*words, *self.arguments[1:]])
 
     def reduced(self, words: list[str], count: int) -> tuple[Path, float]:
         """What a program makes of the dense run, and its CPU seconds."""
@@ -154,7 +139,7 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row]) -> It
     """The rows that are missing."""
     there = {(row["keep"], row["method"]): row for row in known}
     if (1.0, DENSE) not in there:
-        row = capture.row(1.0, DENSE, *capture.train("dense", capture.steps), with_dense=False)
+        row = capture.row(1.0, DENSE, *capture.train(), with_dense=False)
         there[1.0, DENSE] = row
         yield row
     dense = there[1.0, DENSE]
@@ -172,12 +157,6 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row]) -> It
             if (keep, method) not in there:
                 command = [sys.executable, "-m", "lab.training.score_and_train", by, str(seconds)]
                 yield capture.row(keep, method, *capture.reduced(command, count), True)
-        missing = [method for method in (CAP_SHORT, CAP_LONG) if (keep, method) not in there]
-        if missing:
-            cost = capture.step_cost(count)
-            for method in missing:
-                given = seconds + (dense["cpu_seconds"] if method == CAP_LONG else 0.0)
-                yield capture.row(keep, method, *capture.capped(count, given, *cost), False)
 
 
 def _cpu_seconds(words: list[str]) -> float:

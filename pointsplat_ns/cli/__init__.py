@@ -20,9 +20,7 @@ from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
 
-COMMANDS = (
-    *("prune", "compact", "clean", "lod", "tradeoff", "convert", "info", "view", "render", "export", "train", "demo"),
-)
+COMMANDS = (*("prune", "compact", "clean", "lod", "tradeoff", "convert", "info", "view", "render", "export", "demo"),)
 """The commands. Each is a function in a module of the same name, which is imported when the command runs."""
 
 

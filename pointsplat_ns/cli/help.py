@@ -54,10 +54,6 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),
         ("one scene of a trained refiner", "pointsplat export outputs/refiner --scene room2 -o room2.ply"),
     ),
-    "train": (
-        ("50,000 Gaussians from photos with poses", "pointsplat train my_capture --keep 50000"),
-        ("sooner: fewer pixels, fewer steps", "pointsplat train my_capture --keep 50k --scale 0.5 --steps 3000"),
-    ),
     "demo": (
         ("a scene to try commands with: room.ply", "pointsplat demo"),
         ("in another format", "pointsplat demo -o room.spz"),

@@ -9,44 +9,12 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-import torch
-from nerfstudio.data.datamanagers.base_datamanager import DataManager, VanillaDataManager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
-
-if TYPE_CHECKING:
-    _Base = DataManager
-else:
-    _Base = VanillaDataManager
-
-
-class SpiralSource(_Base):
-    """A datamanager around whose first held-out camera ``ns-render spiral`` can draw.
-
-    That command takes nerfstudio's ray-based datamanager and its kin alone, so this is one of them by name. Nothing of
-    it is used: what derives from this has datasets and batches of its own.
-    """
-
-    device: torch.device | str
-
-    def __init__(self) -> None:
-        DataManager.__init__(self)
-
-    @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
-    def eval_dataloader(self) -> FixedIndicesEvalDataloader:
-        """Held-out cameras and photos, one at a time; a DataError if no frame is held out."""
-        if not self.eval_dataset:
-            raise DataError(
-                f"{self.get_datapath()}: no frame is held out, so there is no camera to start from; expected at least "
-                "one: change the dataparser's split"
-            )
-        return FixedIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device, num_workers=0)
 
 
 @dataclass
@@ -62,7 +30,7 @@ class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
     """Memory for decoded photos; by default a quarter of the free memory. Photos that do not fit are read again."""
 
 
-class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset], SpiralSource):
+class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     """Full images and cameras, in the order that nerfstudio's datamanager gives for the same seed, decoded lazily.
 
     Its datasets hold undistorted photos and pinhole cameras.

@@ -67,13 +67,6 @@ def view_source(
     return ViewSource(scene, given, run, functools.partial(dataset_views, data=data), resolution, up)
 
 
-def dataset_facts(path: Path | str, split: Split, data: Path | str | None = None) -> tuple[int, bool]:
-    """Number of photos of a split, and whether they have masks. Arguments and errors are those of
-    :func:`dataset_views`."""
-    _, frames = _open(path, split, data)
-    return len(frames), any(frames.dataset._dataparser_outputs.mask_filenames or ())
-
-
 def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
     """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import signal
 import sys
 import threading
@@ -50,40 +49,17 @@ class StoppableTrainerConfig(TrainerConfig):
     variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
 
     def save_config(self) -> None:
-        """As nerfstudio's, but whole or not at all, and in a folder of its own. Raises PointSplatError if it cannot be
-        written, or no step is asked for."""
+        """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written, or no step is asked
+        for."""
         if self.max_num_iterations < 1:
             raise PointSplatError(
                 f"--max-num-iterations {self.max_num_iterations}: expected at least 1; a run is shown and measured "
                 "without a training by ns-viewer, ns-render and ns-eval"
             )
-        self._take_folder()
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         with replacing(path) as part:
             part.write_text(yaml.dump(self), "utf-8")
-
-    def _take_folder(self) -> None:
-        """Make the folder of the run. If there is one of that name, as of a training that was started in the same
-        second, change the timestamp: two trainings in one folder would replace each other's files. A training that
-        resumes from a checkpoint in its own folder stays there."""
-        given, timestamp = self.get_base_dir(), self.timestamp
-        resumed = self.load_dir or (self.load_checkpoint and self.load_checkpoint.parent)
-        if resumed is not None and resumed.resolve() == self.get_checkpoint_dir().resolve():
-            return
-        try:
-            given.parent.mkdir(parents=True, exist_ok=True)
-            for number in itertools.count(2):
-                with suppress(FileExistsError):
-                    self.get_base_dir().mkdir()
-                    break
-                self.timestamp = f"{timestamp}_{number}"
-        except OSError as error:
-            raise PointSplatError(
-                f"{given}: cannot be made as the folder of this training ({error.strerror}); name another --output-dir"
-            ) from error
-        if self.timestamp != timestamp:
-            CONSOLE.log(f"{given} is the folder of another training; this one gets {self.get_base_dir()}")
 
     def first_step(self) -> int:
         """The step that a training begins with: 0, or the step in the name of the checkpoint that it resumes from."""
@@ -180,8 +156,7 @@ class StoppableTrainer(Trainer):
         with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
             _, losses, metrics = pipeline.get_train_loss_dict(step=step)
             loss = functools.reduce(torch.add, losses.values())
-        own: dict[str, Tensor] = metrics.pop("own_losses", losses)
-        faults = [f"the loss {name} is {value.item():g}" for name, value in own.items() if not value.isfinite()]
+        faults = [f"the loss {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
         skip = processes.any_rank(bool(faults), self.device)
         if not skip:
             self.grad_scaler.scale(loss).backward()

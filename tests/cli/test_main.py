@@ -171,7 +171,7 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
     ("words", "name", "value"),
     [
         ("view a.ply --port 8k", "port", 8000),
-        ("train capture --steps 1,000", "steps", 1000),
+        ("view a.ply --port 1,000", "port", 1000),
         ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
     ],
 )

@@ -73,7 +73,7 @@ def test_too_little_address_space_for_torch_is_one_line(tmp_path):
         ["prune", ""], ["prune", "a.ply", "-o", ""], ["info", "a.ply", ""], ["convert", "a.ply", ""], ["view", ""],
         ["compact", "", "--keep", "10%"], ["render", "a.ply", "-o", ""], ["export", "", "-o", "a.ply"], ["lod", ""],
         ["clean", "", "-o", "a.ply"],
-        ["tradeoff", ""], ["train", ""],
+        ["tradeoff", ""],
         ["demo", "--output", ""],
         ["prune", "a.ply", "--poses", ""],
     ],

@@ -26,13 +26,6 @@ def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
         assert any(known[field] != value for field, value in found.items()), name
 
 
-def test_settings_of_looking_are_in_force_for_their_variant_alone():
-    before = LOOKING.candidates_per_view
-    with ablation.applied({"candidates_per_view": 3, "neighbours": 2}) as settings:
-        assert LOOKING.candidates_per_view == 3 and settings == dataclasses.replace(MERGING, neighbours=2)
-    assert LOOKING.candidates_per_view == before
-
-
 def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
     results = tmp_path / "rows.json"
     ablation.main((small,), keep=(0.2,), variants=TWO, views=2, width=64, json_path=results)
@@ -48,21 +41,6 @@ def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(smal
     assert len({row["covered_psnr"] for row in rows}) == 3
     said = capsys.readouterr().out
     assert all(name in said for name in TWO) and "| 20 % |" in said
-
-
-def test_a_run_is_merged_without_poses_and_with_them(trained_walls, tmp_path, monkeypatch):
-    [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    given, results = [], tmp_path / "rows.json"
-
-    def recorded(scene, k, *, views, settings):
-        given.append(views)
-        return merge(scene, k, views=views, settings=settings)
-
-    ablation.warm_up()
-    monkeypatch.setattr(ablation, "merge", recorded)
-    ablation.main((run,), keep=(0.5,), variants=("no_regrouping",), views=2, json_path=results)
-    assert [row["at"] for row in rows_of(results)] == ["photos"] * 2 + ["photos, poses given"] * 2
-    assert given[:2] == [None, None] and all(len(views) > 2 for views in given[2:])
 
 
 @pytest.mark.usefixtures("usual_looking")

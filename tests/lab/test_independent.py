@@ -1,8 +1,5 @@
 """The lab's own recomputation of scores and encoder, against the package."""
 
-import ast
-from pathlib import Path
-
 import numpy as np
 
 import pointsplat_ns as ps
@@ -50,27 +47,3 @@ def test_the_recomputation_notices_another_definition(monkeypatch, tmp_path):
 def by_deviations(blocks: np.ndarray, scene: independent.Splats) -> np.ndarray:
     factors = np.concatenate([np.ones_like(scene.means), np.exp(-scene.log_scales)], axis=1)
     return blocks * factors[:, :, None] * factors[:, None]
-
-
-def test_what_is_recomputed_imports_nothing_of_the_package():
-    tree = ast.parse(Path(independent.__file__).read_text("utf-8"))
-    outside = [node for node in tree.body if not (isinstance(node, ast.FunctionDef) and node.name == "main")]
-    names = {
-        name.split(".")[0]
-        for node in outside
-        for part in ast.walk(node)
-        if isinstance(part, (ast.Import, ast.ImportFrom))
-        for name in ([part.module] if isinstance(part, ast.ImportFrom) else [alias.name for alias in part.names])
-    }
-    assert names <= {
-        "__future__",
-        "json",
-        "math",
-        "tempfile",
-        "collections",
-        "dataclasses",
-        "pathlib",
-        "numpy",
-        "typing",
-        "tyro",
-    }

@@ -3,7 +3,6 @@
 import json
 import statistics
 
-import pytest
 import torch
 
 import pointsplat_ns as ps
@@ -44,9 +43,3 @@ def test_gains_are_means_over_scenes_and_their_spread_is_over_trainings():
         ["dual", "paper", "10 %", "2", "+3.00", spread],
         ["concat", "paper", "10 %", "1", "-0.50", "-"],
     ]
-
-
-@pytest.mark.parametrize("text", ["dual", "=run", "dual="])
-def test_a_refiner_without_a_name_or_a_file_is_an_error(text):
-    with pytest.raises(SystemExit, match="expected NAME=RUN"):
-        refiners.named(text)

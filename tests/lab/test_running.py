@@ -1,4 +1,4 @@
-"""Commands of nerfstudio that the lab runs."""
+"""Runs in the tables: their photos, and what they differ in from the paper."""
 
 import json
 from pathlib import Path
@@ -9,26 +9,9 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.compare import dataset_photos
-from lab.common.running import has_finished, remove_interrupted
 from lab.tables import layout, scenes
 from lab.tables.measure import measure_tables
 from lab.tables.scenes import differences, paper_dataset
-from making import write_run
-from pointsplat_ns.errors import SceneError
-
-
-def files(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_a_training_of_another_number_of_steps_is_said_and_one_without_a_checkpoint_has_not_finished(tmp_path):
-    checkpoint = write_run(tmp_path, 30, 30)
-    with pytest.raises(SceneError, match="a finished training of 30 steps; expected one of 20 or none"):
-        has_finished(tmp_path, 20)
-    checkpoint.unlink()
-    assert not has_finished(tmp_path, 30) and (tmp_path / "config.yml").is_file()
-    assert not has_finished(tmp_path / "nothing", 30)
-    remove_interrupted(tmp_path / "nothing")
 
 
 def test_a_run_is_judged_by_its_held_out_photos_and_tuned_on_the_others(trained_walls, tmp_path, no_lpips, monkeypatch):
@@ -63,17 +46,6 @@ def run(data: Path, parser: str) -> SimpleNamespace:
     return SimpleNamespace(data=data, dataparser_class=parser)
 
 
-def test_only_an_interrupted_training_is_removed(tmp_path):
-    done, stopped = tmp_path / "done", tmp_path / "stopped"
-    write_run(done, 30, 30)
-    write_run(stopped, 12, 30)
-    remove_interrupted(stopped)
-    assert not stopped.exists()
-    with pytest.raises(SceneError, match="holds a finished training"):
-        remove_interrupted(done)
-    assert len(files(done)) == 2
-
-
 def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path):
     assert paper_dataset(replica(tmp_path, "office2")) == "Replica"
     assert paper_dataset(replica(tmp_path, "kitchen", frames=3)) == ""
@@ -83,25 +55,20 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
     assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
 
 
-def test_scannetpp_is_known_by_the_names_of_its_scenes(tmp_path):
-    for name in ("0a5c013435", "fox"):
-        (tmp_path / name / "dslr").mkdir(parents=True)
-    assert paper_dataset(run(tmp_path / "0a5c013435", SCANNETPP)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "fox", SCANNETPP)) == ""
-    assert paper_dataset(run(tmp_path / "0a5c013436", SCANNETPP)) == ""
-    assert paper_dataset(run(tmp_path / "0a5c013435", "nerfstudio.NerfstudioDataParserConfig")) == ""
-
-
-def test_scannetpp_is_known_by_its_colmap_model_as_the_authors_read_it(tmp_path):
-    colmap = "nerfstudio.data.dataparsers.colmap_dataparser.ColmapDataParserConfig"
-    for name in ("0a5c013435", "fox"):
-        (tmp_path / name / "dslr" / "colmap").mkdir(parents=True)
-    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr" / "colmap", colmap)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "0a5c013435" / "dslr", colmap)) == "ScanNet++"
-    assert paper_dataset(run(tmp_path / "fox" / "dslr", colmap)) == ""
-
-
-SCANNETPP = "nerfstudio.data.dataparsers.scannetpp_dataparser.ScanNetppDataParserConfig"
+@pytest.mark.parametrize(
+    ("scene", "below", "parser", "dataset"),
+    [
+        ("0a5c013435", "", "scannetpp_dataparser.ScanNetppDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "dslr", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "dslr/colmap", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
+        ("0a5c013435", "", "nerfstudio_dataparser.NerfstudioDataParserConfig", ""),
+        ("fox", "", "scannetpp_dataparser.ScanNetppDataParserConfig", ""),
+        ("fox", "dslr", "colmap_dataparser.ColmapDataParserConfig", ""),
+    ],
+)
+def test_scannetpp_is_known_by_the_names_of_its_scenes(scene, below, parser, dataset, tmp_path):
+    (tmp_path / scene / "dslr" / "colmap").mkdir(parents=True)
+    assert paper_dataset(run(tmp_path / scene / below, f"nerfstudio.data.dataparsers.{parser}")) == dataset
 
 
 @pytest.mark.parametrize(
@@ -128,5 +95,6 @@ def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, dif
         datamanager_fields={"camera_res_scale_factor": case["scale"]},
         dataparser_fields={"downscale_factor": case["downscale"]},
     )
-    monkeypatch.setattr(scenes, "dataset_facts", lambda *_: (3, case["masks"]))
+    photo = SimpleNamespace(mask=torch.ones(1) if case["masks"] else None)
+    monkeypatch.setattr(scenes, "run_photos", lambda *_: [photo] * 3)
     assert differences(known, case["sh_degree"], case["seen"], (case["side"], 64)) == differs

@@ -26,15 +26,6 @@ def test_psnr_of_covered_pixels_at_all_extremes(error, covered):
     assert math.isnan(psnr_of(math.nan, covered))
 
 
-def test_psnr_is_torchmetrics():
-    torchmetrics = pytest.importorskip("torchmetrics.functional.image")
-    a, b = pair(20, 30)
-    # 1e-4 dB: float32 sums in another order
-    assert float(psnr(a, b)) == pytest.approx(
-        float(torchmetrics.peak_signal_noise_ratio(a, b, data_range=1.0)), abs=1e-4
-    )
-
-
 @pytest.mark.parametrize("shape", [(11, 11), (24, 37)])
 def test_ssim_is_torchmetrics_away_from_the_border(shape):
     torchmetrics = pytest.importorskip("torchmetrics.functional.image")

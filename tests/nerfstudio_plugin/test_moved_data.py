@@ -11,7 +11,7 @@ import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its 
 import pointsplat_ns as ps
 from making import run_of, without_data
 from pointsplat_ns.cli import main
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
@@ -108,19 +108,3 @@ def test_a_refiners_run_finds_the_scenes_that_moved(make_refined_run, trained_wa
     with pytest.raises(SceneError, match="gone"):
         ps.load(run)
     assert len(ps.load(run, data=tmp_path)) > 0
-
-
-def test_photos_of_other_poses_are_refused_by_data_and_by_photos(runs, moved, trained_walls, tmp_path):
-    """The same capture with its photos in another order: every file is there, and in the frame of the run."""
-    photos = sorted((moved / "wall" / "results").glob("frame*"))
-    contents = [photo.read_bytes() for photo in photos]
-    for photo, content in zip(photos, contents[4:] + contents[:4], strict=True):
-        photo.write_bytes(content)
-    text = "no more like the photos of their views than like others .* dB PSNR in 8 photos"
-    run = run_of(runs, "wall-b")
-    for call in (
-        lambda: ps.prune(run, "50%", data=moved),
-        lambda: ps.measure_tradeoff(run, tmp_path / "trade", repairs=("photos",), data=moved),
-    ):
-        with pytest.raises(DataError, match=text):
-            call()

@@ -5,7 +5,7 @@ import torch
 
 from making import same, scene_to_refine, small_refiner
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner
 
 
@@ -110,26 +110,6 @@ def test_gradients_reach_every_parameter_once_the_zero_layers_have_moved(changes
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
 
-@pytest.mark.parametrize("norm", ["scene", "batch", "layer"])
-def test_a_few_steps_fit_a_target_that_depends_on_neighbours(norm):
-    scene = scene_to_refine(300, sh_degree=1)
-    near = torch.cdist(scene.means, scene.means).topk(4, largest=False).indices
-    target = scene.features_dc[near].mean(dim=1)
-    refiner = small_refiner(trained=False, norm=norm).train()
-    structure = refiner.prepare(scene)
-    optimizer = torch.optim.Adam(refiner.parameters(), lr=3e-3)
-    losses = []
-    for _ in range(60):
-        loss = (refiner(scene, structure).features_dc - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.6 * losses[0]
-    evaluated = (refiner.eval()(scene, structure).features_dc - target).square().mean()
-    assert evaluated < 0.7 * losses[0]
-
-
 def test_a_float64_network_equals_the_float32_one_within_rounding():
     scene = scene_to_refine(dtype=torch.float64)
     refiner = small_refiner()
@@ -138,15 +118,6 @@ def test_a_float64_network_equals_the_float32_one_within_rounding():
     for (key, a), b in zip(single.items(), double.tensors(), strict=True):
         assert a.dtype == torch.float64
         assert torch.allclose(a, b, atol=1e-4), key  # a dozen layers of sums of up to 500 terms in float32
-
-
-def test_parameter_groups_hold_every_parameter_once():
-    refiner = small_refiner()
-    groups = refiner.parameter_groups()
-    assert set(groups) == {"encoder", "backbone", *PARAMETERS}
-    ids = [id(p) for group in groups.values() for p in group]
-    assert sorted(ids) == sorted(id(p) for p in refiner.parameters())
-    assert "encoder" not in small_refiner(encoder="concat").parameter_groups()
 
 
 def test_a_scene_of_a_higher_degree_than_the_network_is_refused():

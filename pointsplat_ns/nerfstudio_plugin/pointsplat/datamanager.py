@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.io.discovery import Supervision, shown_scene
-from pointsplat_ns.nerfstudio_plugin.datamanager import SpiralSource
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
 from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
 
 
 @dataclass
-class ScenesDataManagerConfig(FullImageDatamanagerConfig):
+class ScenesDataManagerConfig(DataManagerConfig):
     """Trained scenes with their posed photos"""
 
     _target: type = field(default_factory=lambda: ScenesDataManager)
@@ -51,23 +48,12 @@ class ScenesDataManagerConfig(FullImageDatamanagerConfig):
     seed: int = 0
     """Determines the order of scenes and photos."""
 
-    # nerfstudio's settings that have no effect here: hidden on the command line. `ns-render dataset` wants them all.
-    dataparser: Suppress[Fixed[Any]] = None
-    camera_res_scale_factor: Suppress[Fixed[float]] = 1.0
-    eval_num_images_to_sample_from: Suppress[Fixed[int]] = -1
-    eval_num_times_to_repeat_images: Suppress[Fixed[int]] = -1
-    eval_image_indices: Suppress[Fixed[Any]] = None
-    cache_images: Suppress[Fixed[Any]] = "cpu"
-    cache_images_type: Suppress[Fixed[Any]] = "uint8"
-    max_thread_workers: Suppress[Fixed[Any]] = None
-    train_cameras_sampling_strategy: Suppress[Fixed[Any]] = "random"
-    train_cameras_sampling_seed: Suppress[Fixed[int]] = 0
-    fps_reset_every: Suppress[Fixed[int]] = 100
+    # nerfstudio's settings that have no effect here: hidden on the command line.
     masks_on_gpu: Suppress[Fixed[bool]] = False
     images_on_gpu: Suppress[Fixed[bool]] = False
 
 
-class ScenesDataManager(SpiralSource):
+class ScenesDataManager(DataManager):
     """Hands out, at each step, one scene and some of its training photos.
 
     The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
@@ -136,14 +122,6 @@ class ScenesDataManager(SpiralSource):
     def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Held-out photos of the shown scene, for the viewer."""
         return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
-
-    @cached_property  # one that the viewer, which reads every property of a datamanager, leaves alone
-    def train_dataparser_outputs(self) -> DataparserOutputs:
-        """File names of the training photos of the shown scene, or of its renders, for ``ns-render dataset``. In a
-        training there is none: its trainer would save the transform of this one scene as that of the run."""
-        if self.test_mode != "test":
-            raise AttributeError("train_dataparser_outputs")
-        return self.training_frames(self.shown).dataset._dataparser_outputs
 
     def setup_train(self) -> None:
         """Nothing: photos are read when they are needed."""

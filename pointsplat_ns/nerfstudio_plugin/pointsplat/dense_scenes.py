@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
 from pointsplat_ns.errors import DataError
@@ -46,7 +45,7 @@ class SampledPoses:
 
 
 class DenseScene:
-    """A dense scene: its Gaussians, read when they are needed, and its own renders from some poses.
+    """A dense scene: its Gaussians, read from a 3DGS PLY when they are needed, and its own renders from sampled poses.
 
     Args:
         name: unique among the scenes in use.
@@ -71,11 +70,16 @@ class DenseScene:
         self.cache, self._device = cache, device
         self._poses = SampledPoses() if poses is None else poses
 
-    @property
+    @cached_property
     def identity(self) -> str:
-        """Text by which a checkpoint records that the network was trained on this scene. It stays the same if the
-        folder is moved, and changes if the scene is trained again."""
-        raise NotImplementedError
+        """Text by which a checkpoint records that the network was trained on this scene: the name, and a fingerprint of
+        the file's size and of the bytes at both ends. It stays the same if the folder is moved."""
+        size, read = self.source.stat().st_size, 1 << 16
+        with self.source.open("rb") as stream:
+            content = stream.read(read)
+            stream.seek(max(0, size - read))
+            content += stream.read()
+        return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
@@ -89,7 +93,7 @@ class DenseScene:
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the file, onto the CPU."""
-        raise NotImplementedError
+        return read_ply(self.source)
 
     def dense(self, keep: bool) -> Gaussians:
         """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""
@@ -144,30 +148,9 @@ class DenseScene:
         return render(self.dense(keep=True).to(self._device), views[0]).cpu()
 
 
-class PlyScene(DenseScene):
-    """A 3DGS PLY without photos or poses.
-
-    A PLY does not say how it was trained, so its identity is its name and a fingerprint of its content.
-    """
-
-    def read_dense(self) -> Gaussians:
-        """Read the Gaussians from the file, onto the CPU."""
-        return read_ply(self.source)
-
-    @cached_property
-    def identity(self) -> str:
-        """The name, and a fingerprint of the file's size and of the bytes at both ends."""
-        size, read = self.source.stat().st_size, 1 << 16
-        with self.source.open("rb") as stream:
-            content = stream.read(read)
-            stream.seek(max(0, size - read))
-            content += stream.read()
-        return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
-
-
 class RenderedDataset:
     """Renders of a dense scene from the cameras of a split, with the part of a dataset's interface that nerfstudio's
-    viewer and ``ns-render`` use."""
+    viewer uses."""
 
     def __init__(self, scene: DenseScene, split: Split):
         self._scene, self._split = scene, split
@@ -176,12 +159,6 @@ class RenderedDataset:
     def cameras(self) -> Cameras:
         """The cameras, found when they are first needed."""
         return self._scene.cameras(self._split)
-
-    @property
-    def _dataparser_outputs(self) -> DataparserOutputs:
-        # There are no files: ``ns-render dataset`` names its own after these.
-        names = [Path(f"{index:05d}.png") for index in range(len(self))]
-        return DataparserOutputs(image_filenames=names, cameras=self.cameras)
 
     def __bool__(self) -> bool:
         return True  # of no scene are there no poses; nerfstudio asks before they have to be found

@@ -122,19 +122,14 @@ def evaluate_scene(
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed, and with
-    separate means for scenes compared with photos and for scenes compared with renders of the dense scene."""
-    parts = []
-    for photos in (True, False):
-        some = [report for report in reports if report.has_photos == photos]
-        if some:
-            parts.append({**_means(some, with_std), "reference": REFERENCES[photos]})
-    summary = {**parts[0], "scenes": {report.name: report.block() for report in reports}}
-    return summary if len(parts) == 1 else {**summary, "against_dense_renders": parts[1]}
+    """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed. Means are
+    over the scenes that are compared with photos, or over all where there is none."""
+    judged = [report for report in reports if report.has_photos] or reports
+    scenes = {report.name: report.block() for report in reports}
+    return {**_means(judged, with_std), "reference": REFERENCES[judged[0].has_photos], "scenes": scenes}
 
 
 def _means(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    """Means over scenes that are compared with the same kind of reference."""
     unseen = [r for r in reports if not r.seen_in_training]
     seen = [r for r in reports if r.seen_in_training]
     judged = unseen or reports
@@ -151,35 +146,28 @@ def _means(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
 
 
 def print_summary(summary: dict[str, Any]) -> None:
-    """Print the results of ``ns-eval``: a table of the scenes compared with photos, one of those compared with renders
-    of the dense scene, and the reason if LPIPS is missing."""
+    """Print the results of ``ns-eval``: a table, and the reason if LPIPS is missing."""
     settings = summary["settings"]
+    scenes, reference = summary["scenes"], summary["reference"]
+    blocks = [(name, "yes" if scene["seen_in_training"] else "never", scene) for name, scene in scenes.items()]
+    if len(blocks) > 1:
+        means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
+        blocks += [("average", seen, summary[key]) for seen, key in means if key in summary]
+    rows = [
+        (
+            *((name, seen) if variant == VARIANTS[0] else ("", "")),
+            variant,
+            *("-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}" for key, _, digits in COLUMNS),
+        )
+        for name, seen, scene in blocks
+        for variant in VARIANTS
+    ]
+    header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
     made = f"keep {settings['keep']}, by {settings['by']}, refiner {settings['size']}"
-    for part in filter(None, (summary, summary.get("against_dense_renders"))):
-        blocks = [
-            (name, "yes" if scene["seen_in_training"] else "never", scene)
-            for name, scene in summary["scenes"].items()
-            if scene["reference"] == part["reference"]
-        ]
-        if len(blocks) > 1:
-            means = (("", "average"), ("yes", "average_seen"), ("never", "average_unseen"))
-            blocks += [("average", seen, part[key]) for seen, key in means if key in part]
-        rows = [
-            (
-                *((name, seen) if variant == VARIANTS[0] else ("", "")),
-                variant,
-                *(
-                    "-" if (value := scene[variant][key]) is None else f"{value:,.{digits}f}"
-                    for key, _, digits in COLUMNS
-                ),
-            )
-            for name, seen, scene in blocks
-            for variant in VARIANTS
-        ]
-        header = ("scene", "seen in training", "variant", *(title for _, title, _ in COLUMNS))
-        reference = "held-out photos" if part["reference"] == REFERENCES[True] else "the dense scenes' own renders"
-        title = f"{made}; compared with {reference}"
-        print_table(header, rows, title=title, left=(0, 1, 2), section=len(VARIANTS))
+    print_table(header, rows, title=f"{made}; compared with {reference}", left=(0, 1, 2), section=len(VARIANTS))
+    others = [name for name, scene in scenes.items() if scene["reference"] != reference]
+    if others:
+        print(f"compared with {REFERENCES[False]}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
         print(f"no LPIPS: {summary['lpips_note']}")
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import torch.distributed as dist
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from pointsplat_ns.errors import SceneError
@@ -29,7 +26,7 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
     print_summary,
     summarize,
 )
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES, PointSplatModel, PointSplatModelConfig
+from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
 
@@ -116,17 +113,13 @@ class PointSplatPipeline(VanillaPipeline):
 
         Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
         place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
-        been stopped. Several processes take turns in that sequence. The values of their losses and metrics are means
-        over processes; the gradients are each process's own, and so are the ``own_losses`` among the metrics.
+        been stopped. Several processes take turns in that sequence; losses and metrics are each process's own.
         """
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
-        outputs, own, metrics = self.model.losses(index, frames)
-        means = means_over_ranks({**own, "psnr": metrics["psnr"]}, (*PIXEL_LOSSES, "lpips", "psnr"))
-        # the values of the means, with the gradients of this process's own
-        losses = own if self.world_size == 1 else {n: v + (means[n] - v).detach() for n, v in own.items()}
-        return outputs, losses, metrics | {"psnr": means["psnr"], "scene": index, "own_losses": own}
+        outputs, losses, metrics = self.model.losses(index, frames)
+        return outputs, losses, metrics | {"scene": index}
 
     @torch.no_grad()
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict, dict]:
@@ -160,8 +153,7 @@ class PointSplatPipeline(VanillaPipeline):
             ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant); and ``scenes``. Values that
             cannot be computed are None, and ``lpips_note`` says why LPIPS is missing. ``reference``, here and in each
             scene, says what renders were compared with: ``photos``, or ``dense renders`` if a scene has no photos (its
-            dense variant then has no PSNR). If there are scenes of both kinds, the values above are those of scenes
-            with photos, and ``against_dense_renders`` holds those of the others.
+            dense variant then has no PSNR). Means are over the scenes with photos if there are any.
         """
         training = self.training
         self.eval()
@@ -217,19 +209,3 @@ class PointSplatPipeline(VanillaPipeline):
                 )
 
         return [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], save)]
-
-
-def means_over_ranks(values: dict[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-    """Mean of each named scalar over the processes that have it, without gradient, for the names that this process has.
-    ``names`` are the same in every process; ``values`` are this process's, on its device."""
-    present = [name for name in names if name in values]
-    if processes.world_size() == 1:
-        return {name: values[name].detach() for name in present}
-    device = next(iter(values.values())).device
-    table = torch.zeros(2, len(names), dtype=torch.float64, device=device)  # sums and counts
-    for column, name in enumerate(names):
-        if name in values:
-            table[0, column], table[1, column] = values[name].detach().double(), 1.0
-    dist.all_reduce(table)
-    means = dict(zip(names, table[0] / table[1], strict=True))
-    return {name: means[name].to(values[name].dtype) for name in present}

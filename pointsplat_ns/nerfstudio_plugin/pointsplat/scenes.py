@@ -29,7 +29,7 @@ from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint, read_photo_fit
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, PlyScene, SampledPoses, Split
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses, Split
 from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
@@ -130,7 +130,7 @@ class TrainedScene(DenseScene):
         self.run = run
         self.has_photos = has_photos
 
-    @property
+    @cached_property
     def identity(self) -> str:
         """EXPERIMENT/METHOD/TIME and the step. A scene that is trained again has another time, and so another identity.
 
@@ -258,7 +258,7 @@ def training_scenes(
                 need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
         if has_photos or chosen == "dense":
             scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
-    scenes += [PlyScene(name, path, cache, poses, device) for name, path in plys.items()]
+    scenes += [DenseScene(name, path, cache, poses, device) for name, path in plys.items()]
     if not scenes:
         others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""
         raise SceneError(

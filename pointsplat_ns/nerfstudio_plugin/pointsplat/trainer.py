@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.config import PointSplatTrainerConfig
 
 
-SECONDS_BETWEEN_CHECKPOINTS = 600.0
-"""A training that is killed loses at most this time, however slow its steps are."""
-
-
 def rate_factor_at(share: float, schedule: Literal["cosine", "step"], drop_at: float = 0.6) -> float:
     """Learning rate over its peak, when a share of the training has passed. ``cosine``: from 0 linearly to 1 at 5 %,
     then along a cosine to 0.02 at the end. ``step``: 1, and 0.1 from the share ``drop_at`` on."""
@@ -39,13 +35,12 @@ def rate_factor_at(share: float, schedule: Literal["cosine", "step"], drop_at: f
 
 
 class PointSplatTrainer(StoppableTrainer):
-    """Trains for a number of steps or for a time. Checkpoints also come every :data:`SECONDS_BETWEEN_CHECKPOINTS`."""
+    """Trains for a number of steps or for a time."""
 
     config: PointSplatTrainerConfig
     pipeline: PointSplatPipeline
     clock = staticmethod(time.monotonic)
     """Seconds since any moment."""
-    _seconds_of_checkpoint = 0.0
     _last_step = sys.maxsize
 
     def __init__(self, config, local_rank: int = 0, world_size: int = 1) -> None:
@@ -80,19 +75,6 @@ class PointSplatTrainer(StoppableTrainer):
                 f"--seconds {seconds:g}: the training has taken {spent:.0f} s up to its checkpoint; expected more, as "
                 "it is the total"
             )
-        self._seconds_of_checkpoint = spent
-
-    def one_step(self, step: int):
-        """As the base class, and a checkpoint if the latest one is old."""
-        result = super().one_step(step)
-        if self.pipeline.seconds - self._seconds_of_checkpoint >= SECONDS_BETWEEN_CHECKPOINTS:
-            self.save_checkpoint(step)
-        return result
-
-    def save_checkpoint(self, step: int) -> None:
-        """As nerfstudio's; all processes call it, the first one writes."""
-        super().save_checkpoint(step)
-        self._seconds_of_checkpoint = self.pipeline.seconds
 
     def update(self, step: int, names: list[str], skipped: bool) -> None:
         """As the base class. Before, count the time since the step before, and end the training after this one if the

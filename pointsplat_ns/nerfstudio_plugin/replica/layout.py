@@ -96,27 +96,24 @@ class ReplicaScene:
     Attributes:
         folder: The scene folder.
         params: Intrinsics and depth scale.
-        numbers: Frame numbers from the file names, ascending.
-        photos: One photo per number.
-        depths: One depth image per number, or None if the scene has no depth.
+        photos: By ascending number.
+        depths: One depth image for each photo, or None if one has none.
         poses: float64 (F, 4, 4) camera-to-world, OpenCV axes, rotations exactly orthonormal.
     """
 
     folder: Path
     params: PinholeParams
-    numbers: tuple[int, ...]
     photos: tuple[Path, ...]
     depths: tuple[Path, ...] | None
     poses: np.ndarray  # [F, 4, 4]
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.photos)
 
     def select(self, indices: list[int]) -> "ReplicaScene":
         """The same scene with only the frames at these positions, in this order."""
         return replace(
             self,
-            numbers=tuple(self.numbers[i] for i in indices),
             photos=tuple(self.photos[i] for i in indices),
             depths=None if self.depths is None else tuple(self.depths[i] for i in indices),
             poses=self.poses[indices],
@@ -144,16 +141,9 @@ def load_replica(folder: Path) -> ReplicaScene:
     numbers = sorted(photos)
     poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
-        missing = [n for n in range(numbers[0], numbers[0] + len(poses)) if n not in photos]
         raise DataError(
             f"{trajectory}: {len(poses)} poses for {len(numbers)} photos in {folder / names.photos}; expected one line "
-            "per photo" + (f"; no photo has the number {missing[0]}" if missing else "")
-        )
-    missing = [n for n in numbers if n not in depths] if depths else []
-    if missing:
-        raise DataError(
-            f"{folder / names.depths}: {len(missing)} of {len(numbers)} photos have no depth image (first "
-            f"{photos[missing[0]].name}); restore them, or remove all depth images to go without depth"
+            "per photo"
         )
     finite = (np.abs(poses) < FARTHEST).all(axis=(1, 2))  # NaN fails too
     keep, lost = np.flatnonzero(finite).tolist(), (np.flatnonzero(~finite) + 1).tolist()
@@ -166,9 +156,8 @@ def load_replica(folder: Path) -> ReplicaScene:
     return ReplicaScene(
         folder=folder,
         params=_params(folder, names, photos[numbers[0]]),
-        numbers=tuple(numbers[i] for i in keep),
         photos=tuple(photos[numbers[i]] for i in keep),
-        depths=tuple(depths[numbers[i]] for i in keep) if depths else None,
+        depths=tuple(depths[numbers[i]] for i in keep) if depths.keys() >= photos.keys() else None,
         poses=_rigid(poses[keep], [i + 1 for i in keep], trajectory),
     )
 
@@ -258,13 +247,8 @@ def _decoded(path: Path, params: PinholeParams) -> Any:
 
 def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
     """The files of a folder whose names match, by the number in the name; none if there is no such folder."""
-    found: dict[int, Path] = {}
-    for path in sorted(folder.glob("*")):
-        if match := re.fullmatch(pattern, path.name, re.IGNORECASE):
-            first = found.setdefault(int(match.group(1)), path)
-            if first != path:
-                raise DataError(f"{folder}: {first.name} and {path.name} have the same number; keep one of them")
-    return found
+    matches = ((path, re.fullmatch(pattern, path.name, re.IGNORECASE)) for path in sorted(folder.glob("*")))
+    return {int(match.group(1)): path for path, match in matches if match}
 
 
 def _rigid(poses: np.ndarray, lines: list[int], path: Path) -> np.ndarray:

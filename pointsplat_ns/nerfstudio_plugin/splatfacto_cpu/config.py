@@ -59,7 +59,7 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
     config = copy.deepcopy(config)
     defaults = SplatfactoCpuModelConfig()
     model = config.pipeline.model
-    steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at", "stop_relocation_at"]
+    steps = ["warmup_length", "resolution_schedule", "sh_degree_interval", "stop_split_at"]
     fitted: dict[str, float] = {name: max(1, round(share * getattr(defaults, name))) for name in steps}
     fitted["refine_every"] = min(defaults.refine_every, max(25, round(length / 70)))
     haste = min(8.0, 1 / math.sqrt(share))

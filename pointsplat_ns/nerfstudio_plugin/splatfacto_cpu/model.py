@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from gsplat.strategy.base import Strategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -27,81 +26,30 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, RasterizerOptions, need_pinhole
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.capped import CappedStrategy
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import (
-    at_most,
-    distance_to_others,
-    finite_seeds,
-    random_seeds,
-    random_seeds_near_cameras,
-)
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import distance_to_others, finite_seeds, random_seeds
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
 
 
-class LpipsMetric:
-    """LPIPS, called like nerfstudio's metrics. Not a module, so that checkpoints do not hold its weights."""
-
-    def __init__(self) -> None:
-        self._lpips = ReportedLpips("alex")
-
-    @property
-    def reason(self) -> str | None:
-        """Why LPIPS could not be computed; None if it could, so far."""
-        return self._lpips.reason
+class LpipsMetric(ReportedLpips):
+    """LPIPS, called like nerfstudio's metrics."""
 
     def __call__(self, image: Tensor, other: Tensor) -> Tensor:
         """LPIPS of two (1, 3, H, W) images in [0, 1]; NaN, with ``reason`` set, if it cannot be computed."""
-        value = self._lpips(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
+        value = super().__call__(image.permute(0, 2, 3, 1), other.permute(0, 2, 3, 1))
         return image.new_tensor(math.nan) if value is None else value.mean()
 
 
 @dataclass
 class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
-    """Splatfacto's config, the options of the rasterizer, and those of densification with a cap"""
+    """Splatfacto's config, and the options of the rasterizer"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuModel)
-    max_gs_num: int | None = None
-    """Number of Gaussians of the trained scene, which 3DGS-MCMC then reaches at stop_split_at; by default Splatfacto's
-    densification decides."""
-    stop_relocation_at: int = 25_000
-    """Step at which 3DGS-MCMC stops to move Gaussians to others."""
-
-    def densification(self, num_photos: int) -> Strategy:
-        """The strategy of a training on that many photos. Raises PointSplatError if ``max_gs_num`` is below 1."""
-        if self.max_gs_num is not None:
-            if self.max_gs_num < 1:
-                raise PointSplatError(f"--pipeline.model.max-gs-num {self.max_gs_num}: expected at least 1")
-            return CappedStrategy(
-                most=self.max_gs_num,
-                first_step=self.warmup_length,
-                full_from=self.stop_split_at,
-                last_step=self.stop_relocation_at,
-                every=self.refine_every,
-            )
-        return DefaultStrategy(
-            prune_opa=self.cull_alpha_thresh,
-            grow_grad2d=self.densify_grad_thresh,
-            grow_scale3d=self.densify_size_thresh,
-            grow_scale2d=self.split_screen_size,
-            prune_scale3d=self.cull_scale_thresh,
-            prune_scale2d=self.cull_screen_size,
-            refine_scale2d_stop_iter=self.stop_screen_size_at,
-            refine_start_iter=self.warmup_length,
-            refine_stop_iter=self.stop_split_at,
-            reset_every=self.reset_alpha_every * self.refine_every,
-            refine_every=self.refine_every,
-            pause_refine_after_reset=num_photos + self.refine_every,
-            absgrad=self.use_absgrad,
-            revised_opacity=False,
-            verbose=True,
-        )
 
 
 class SplatfactoCpuModel(SplatfactoModel):
@@ -119,12 +67,26 @@ class SplatfactoCpuModel(SplatfactoModel):
         Splatfacto's own method is not called: it puts seed points on CUDA and downloads LPIPS.
         """
         config = self.config
-        self.strategy = config.densification(self.num_train_data)
+        self.strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=config.stop_split_at,
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            revised_opacity=False,
+            verbose=True,
+        )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         self.seed_points = None if config.random_init else finite_seeds(self.seed_points)
-        drawn = random_seeds if config.max_gs_num is None else random_seeds_near_cameras
-        seeds = at_most(config.max_gs_num, *(self.seed_points or drawn(config)))
-        self.gauss_params = self._seed_parameters(*seeds)
+        self.gauss_params = self._seed_parameters(*(self.seed_points or random_seeds(config)))
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
         )
@@ -167,14 +129,7 @@ class SplatfactoCpuModel(SplatfactoModel):
         return torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
 
     def load_state_dict(self, dict: Mapping[str, Any], **kwargs):  # type: ignore[override]  # as nerfstudio's
-        """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints. Raises PointSplatError if it
-        has more Gaussians than the cap."""
-        num, most = len(dict["gauss_params.means" if "gauss_params.means" in dict else "means"]), self.config.max_gs_num
-        if most is not None and num > most:
-            raise PointSplatError(
-                f"the checkpoint has {num:,} Gaussians; expected at most {most:,}, as --pipeline.model.max-gs-num "
-                "says; pointsplat compact makes a run smaller"
-            )
+        """As Splatfacto's, but ignores the LPIPS weights in nerfstudio's own checkpoints."""
         return super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
 
     def get_training_callbacks(
@@ -291,15 +246,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             absgrad=self.strategy.absgrad,
             rasterize_mode=self.config.rasterize_mode,
         )
-
-    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """As Splatfacto's, and in trainings with a cap the paper's weights on opacity and size, which free Gaussians
-        that are not needed where they are."""
-        losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if self.training and self.config.max_gs_num is not None:
-            losses["opacity_reg"] = 0.01 * _sigmoid(self.opacities).mean()
-            losses["size_reg"] = 0.01 * torch.exp(self.scales).mean()
-        return losses
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]

@@ -6,7 +6,6 @@ import torch
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.system.tensors import FLOATS
@@ -15,27 +14,6 @@ from pointsplat_ns.system.tensors import FLOATS
 def random_seeds(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) in a cube around the origin, and no colours (0, 3), as Splatfacto starts without seed points."""
     return (torch.rand(config.num_random, 3, **FLOATS) - 0.5) * config.random_scale, torch.zeros(0, 3, **FLOATS)
-
-
-def random_seeds_near_cameras(config: SplatfactoModelConfig) -> tuple[Tensor, Tensor]:
-    """Positions (N, 3) in the ball of the same width, and no colours (0, 3), for few Gaussians: nerfstudio puts the
-    cameras into the unit ball, which has less than 1 % of Splatfacto's cube.
-
-    They are uniform in the contracted space of mip-NeRF 360 (arXiv 2111.12077, equation 10). With 4,000 Gaussians this
-    gains 1.5 dB in 800 steps (fox, which has no seed points).
-    """
-    reach = max(1.0, config.random_scale / 2)
-    contracted = (2 - 1 / reach) * torch.rand(config.num_random, 1, **FLOATS) ** (1 / 3)
-    distances = torch.where(contracted < 1, contracted, 1 / (2 - contracted))
-    return distances * normalize(torch.randn(config.num_random, 3, **FLOATS), dim=1), torch.zeros(0, 3, **FLOATS)
-
-
-def at_most(most: int | None, points: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
-    """At most so many positions (N, 3), chosen at random, and their colours."""
-    if most is None or len(points) <= most:
-        return points, colors
-    chosen = torch.randperm(len(points), device="cpu")[:most]
-    return points[chosen], colors[chosen] if len(colors) > 0 else colors
 
 
 def distance_to_others(points: Tensor, k: int) -> Tensor:

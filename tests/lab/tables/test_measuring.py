@@ -1,16 +1,13 @@
 """Tables of a small room, really measured: every way, what cannot be measured, and going on."""
 
 import json
-import shlex
-import sys
 from pathlib import Path
 
 import pytest
 
 import pointsplat_ns as ps
-from lab.common.printing import start
 from lab.tables.cells import Tables
-from lab.tables.measure import Judge, measure_tables
+from lab.tables.measure import Judge
 from lab.tables.ways import WAYS
 from making import box_room
 from pointsplat_ns.errors import PointSplatError, SceneError
@@ -106,13 +103,6 @@ def test_weights_that_know_the_scene_do_not_test_it(measured, weights):
     assert "were trained on this scene" in tables.missing["room/pointsplat/30%"]
 
 
-def test_a_program_that_fails_leaves_out_its_own_cell_alone(measured, peer, caplog):
-    tables = measured(splat_transform=peer(fails="--decimate"), only=["room/splat*/*"])
-    assert [*cells_of(tables)] == [("splat-transform-adaptive", 0.3)]
-    assert "ended with status 1: out of luck" in tables.missing["room/splat-transform/30%"]
-    assert "room/splat-transform/30%: left out: " in caplog.text
-
-
 def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_path, monkeypatch):
     figures, asked = Judge.figures, []
 
@@ -133,13 +123,6 @@ def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_pa
     assert {key: after[key] for key in before} == before  # also their times: they are not measured again
     monkeypatch.setattr(Judge, "figures", lambda *args: pytest.fail("nothing is left to be measured"))
     measured()
-
-
-def test_more_steps_are_measured_and_other_cells_left_alone(measured, few_ways):
-    first, second = cells_of(measured()), cells_of(measured(fine_tune=3))
-    assert second["lightgaussian-tuned", 0.3]["made_with"] == "3 steps"
-    unchanged = [key for key, cell in first.items() if cell == second[key]]
-    assert unchanged == [("dense", 1.0), ("paper", 0.1), ("paper", 0.3), ("lightgaussian", 0.3)]
 
 
 def test_tables_are_of_all_scenes_of_the_folder(measured, tmp_path, room):
@@ -168,26 +151,6 @@ def test_options_that_mean_nothing_are_refused(measured, options, said):
         measured(**options)
 
 
-def test_two_scenes_of_one_name_and_no_scene_are_refused(measured, room, tmp_path):
-    (tmp_path / "other").mkdir()
-    ps.save(box_room(1, 300), tmp_path / "other" / "room.ply")
-    with pytest.raises(PointSplatError, match="two scenes have one name"):
-        measured(room, tmp_path / "other" / "room.ply")
-    with pytest.raises(PointSplatError, match="no scene is named"):
-        measure_tables([], tmp_path / "tables")
-
-
-def test_cells_of_another_scene_or_of_other_views_are_refused_unless_forced(measured, room):
-    only = ["room/dense/*"]
-    measured(only=only)
-    with pytest.raises(SceneError, match="of another side .640, now 40."):
-        measured(only=only, side=40)
-    ps.save(box_room(5, 200), room, overwrite=True)
-    with pytest.raises(SceneError, match="of another file"):
-        measured(only=only)
-    assert cells_of(measured(only=only, force=True))["dense", 1.0]["point"]["gaussians"] == 200
-
-
 @pytest.mark.parametrize(
     "content", ["", "{", "[]", "null", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}']
 )
@@ -208,15 +171,3 @@ def test_files_of_others_are_not_overwritten(measured, tmp_path):
     with pytest.raises(SceneError, match="is a file"):
         measured(folder=tmp_path / "file")
     assert (tmp_path / "tables" / "tables.md").read_text() == "mine"
-
-
-def test_a_cells_command_measures_it_again(measured, room, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    made = measured(Path("room.ply"), folder=Path("tables"), only=["room/paper/30%"])
-    words = shlex.split(made.cells["room/paper/30%"]["point"]["command"])
-    assert words[:3] == ["python", "-m", "lab.tables"]
-    monkeypatch.setattr(sys, "argv", words[2:])
-    start(measure_tables)
-    again = Tables.read(tmp_path / "tables").cells["room/paper/30%"]["point"]
-    assert again["against_dense"] == made.cells["room/paper/30%"]["point"]["against_dense"]
-    assert again["command"] == made.cells["room/paper/30%"]["point"]["command"]

@@ -1,13 +1,11 @@
 """Ways of a table."""
 
 import shlex
-import sys
 
 import pytest
 
 import pointsplat_ns as ps
-from lab.common.programs import ProgramFailed
-from lab.common.ways import Reducer, SplatTransform
+from lab.common.ways import SplatTransform
 from lab.tables.ways import PROTOCOL, WAYS, cell_key
 from making import box_room
 
@@ -42,15 +40,3 @@ def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
 def test_versions_are_told_apart(peer, says, version, modes):
     found = SplatTransform(peer(says))
     assert found.version == version and len(found.modes) == modes
-
-
-def test_a_program_that_writes_nothing_is_an_error(tmp_path):
-    reducer = Reducer("idle", lambda source, count, target: [sys.executable, "-I", "-S", "-c", "pass"])
-    with pytest.raises(ProgramFailed, match="wrote no file"):
-        reducer.reduce(tmp_path / "room.ply", 10)
-
-
-@pytest.mark.parametrize("says", ["", "no version", "vx.y", "v" + "9" * 5000])
-def test_what_is_no_version_is_none(peer, says):
-    found = SplatTransform(peer(says))
-    assert found.modes == () and "ended with 0; is Node's package installed?" in found.missing

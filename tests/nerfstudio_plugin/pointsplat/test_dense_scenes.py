@@ -16,7 +16,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import PlyScene, SampledPoses
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D, Views
 
@@ -35,8 +35,8 @@ def rooms(tmp_path_factory) -> Path:
     return folder
 
 
-def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> PlyScene:
-    return PlyScene("one", rooms / "one.ply", MemoryCache(cache_bytes), POSES)
+def scene_of(rooms: Path, cache_bytes: int = 1 << 24) -> DenseScene:
+    return DenseScene("one", rooms / "one.ply", MemoryCache(cache_bytes), POSES)
 
 
 def manager_of(folder: Path, **settings):
@@ -89,7 +89,9 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
         # half a level where they are rounded, float32 noise where they are not
         torch.testing.assert_close(image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0)
         assert data["image_idx"] == len(frames) - 1 and image.std() > 0.05 and not data["image"].requires_grad
-    assert scene.rendered_train[0][1]["image"].dtype == torch.uint8
+    image = scene.rendered_train[0][1]["image"]
+    assert image.dtype == torch.uint8
+    assert torch.equal(scene.rendered_train.dataset[0]["image"], image / 255), "what the viewer shows"
     with pytest.raises(IndexError):
         scene.rendered_train[6]
     # Every second training picture is subsampled from one of the size that people look at.

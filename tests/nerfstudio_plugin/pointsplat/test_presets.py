@@ -1,6 +1,5 @@
 """The methods pointsplat-paper and pointsplat-authors against their sources, and trained for two steps."""
 
-import shutil
 from functools import reduce
 from unittest import mock
 
@@ -15,7 +14,7 @@ from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
-from pointsplat_ns.refiner import Refiner, preset
+from pointsplat_ns.refiner import Refiner
 from pointsplat_ns.refiner.weights import read_metadata
 
 PRESETS = {"paper": paper_config, "authors": authors_config}
@@ -157,16 +156,3 @@ def test_settings_out_of_range_are_refused(changes, said):
         setattr(config, name, value)
     with pytest.raises(PointSplatError, match=said):
         config.setup(local_rank=0, world_size=1)
-
-
-def test_a_run_that_was_made_before_these_options_opens(trained, tmp_path):
-    folder = shutil.copytree(trained[0].get_base_dir(), tmp_path / "run")
-    path = folder / "config.yml"
-    later = ("enc_depths:", "stem:", "raw_inputs:", "means_reach:", "train_encoder:", "drop_at:", "global_norm:")
-    lines = path.read_text().splitlines(keepends=True)
-    kept = [line for line in lines if not line.lstrip().startswith(later)]
-    assert len(kept) == len(lines) - len(later)
-    path.write_text("".join(kept))
-    weights = trained[1].pipeline.model.refiner.state_dict()
-    for opened in (load_refiner(folder).network, eval_setup(path)[1].model.refiner):
-        assert opened.config == preset("tiny") and equal(opened.state_dict(), weights)

@@ -4,11 +4,9 @@ import math
 
 import pytest
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import equal, move_zero_layers, small_config
-from pointsplat_ns.compression.trained_refiner import load_refiner
+from making import move_zero_layers, small_config
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 
@@ -44,21 +42,6 @@ def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls,
     assert moved[0] == pytest.approx(plain[0], rel=1e-4)  # undoing a transform rounds: thresholds flip in few pixels
     assert moved[1] != plain[1]
     assert moved == again, "the same seed draws the same transforms"
-
-
-@pytest.mark.parametrize(
-    "changes", [{"use_appearance": False, "use_position": False}, {"encoder": "concat"}, {"norm": "batch"}], ids=str
-)
-def test_each_network_trains_and_its_run_opens_again(trained_walls, run_training, tmp_path, no_lpips, changes):
-    config = small_config(trained_walls, tmp_path, 2, **changes)
-    trainer, losses = run_training(config)
-    refiner = trainer.pipeline.model.refiner
-    assert len(losses) == 2 and not trainer.skipped
-    again = eval_setup(config.get_base_dir() / "config.yml")[1]
-    for opened in (load_refiner(config.get_base_dir()).network, again.model.refiner):
-        assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
-    settings = again.get_average_eval_image_metrics()["settings"]
-    assert all(settings[name] == value for name, value in changes.items())
 
 
 def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls, tmp_path):

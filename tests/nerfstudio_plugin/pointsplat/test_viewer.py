@@ -2,15 +2,12 @@
 
 from unittest import mock
 
-import matplotlib.image
-import numpy as np
 import torch
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.scripts.render import DatasetRender
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from making import fast_config, same
+from making import same
 from pointsplat_ns.cli.scene_options import claims_until_the_end
 from pointsplat_ns.io import read_ply
 
@@ -60,24 +57,3 @@ def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, tr
     assert same(ours, expected)
     drawn = expected[expected.opacities[:, 0] >= -5.5373]  # ns-export drops opacities below 1/255
     assert len(drawn) > 0 and same(theirs, drawn)
-
-
-def test_ns_render_draws_the_sampled_views_of_a_scene_without_photos(three_rooms, tmp_path):
-    config = fast_config(three_rooms, tmp_path / "runs")
-    manager = config.pipeline.datamanager
-    manager.supervision, manager.sampled_poses, manager.sampled_size = "dense", 10, (32, 24)
-    config.save_config()
-    config.get_checkpoint_dir().mkdir()
-    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
-    state = {"step": 9, "pipeline": pipeline.state_dict()}
-    torch.save(state, config.get_checkpoint_dir() / "step-000000009.ckpt")
-    folder = tmp_path / "renders"
-    render = DatasetRender(config.get_base_dir() / "config.yml", folder, split="train+test", image_format="png")
-    render.main()
-    shown = pipeline.datamanager.scenes[pipeline.datamanager.shown]
-    for split, frames in (("train", shown.rendered_train), ("test", shown.rendered_eval)):
-        written = sorted((folder / split / "gt-rgb").iterdir())
-        assert len(frames) == len(list((folder / split / "rgb").iterdir())) == len(written) > 1
-        for path, (_, data) in zip(written, frames, strict=True):
-            image = data["image"].float() / (255 if data["image"].dtype == torch.uint8 else 1)
-            assert np.abs(matplotlib.image.imread(path)[..., :3] - image.numpy()).max() < 1 / 255  # rounded to 8 bits

@@ -1,9 +1,10 @@
-"""Interrupted trainings, and skipped steps."""
+"""Interrupted trainings, skipped steps, and numbers below the smallest normal float."""
 
 import copy
 import math
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest import mock
@@ -21,6 +22,7 @@ from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainer, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero
 
 LATER = "2031-01-01_000000"
 """When a training goes on that began a moment ago: in the same second it would have the same folder."""
@@ -200,3 +202,22 @@ def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
     with broken("nan", range(5, 12)), pytest.raises(DataError, match=message) as caught:
         run_training(config)
     assert "\n" not in str(caught.value) and (config.get_checkpoint_dir() / "step-000000007.ckpt").is_file()
+
+
+def test_a_training_takes_tiny_numbers_as_zero_also_in_threads_and_only_while_it_runs(started, monkeypatch):
+    found, losses_of = [], SplatfactoCpuModel.get_loss_dict
+
+    def losses(self, *args, **kwargs):
+        thread = threading.Thread(target=lambda: found.append(takes_tiny_as_zero()))
+        thread.start()
+        thread.join()
+        found.append(takes_tiny_as_zero())
+        if len(found) > 2:
+            raise ZeroDivisionError
+        return losses_of(self, *args, **kwargs)
+
+    monkeypatch.setattr(SplatfactoCpuModel, "get_loss_dict", losses)
+    assert not takes_tiny_as_zero()
+    with pytest.raises(ZeroDivisionError):
+        started.train()
+    assert set(found) == {torch.set_flush_denormal(False)} and not takes_tiny_as_zero()

@@ -14,6 +14,7 @@ from nerfstudio.utils import writer
 
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
+from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import fitted_schedules, splatfacto_cpu_config
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.trainer import STATE
 from pointsplat_ns.rasterizer import rasterization
@@ -120,6 +121,21 @@ def test_extreme_seeds_have_finite_sizes_or_are_dropped():
     assert build(SplatfactoCpuModelConfig(), (points, colors)).num_points == 4
     for nothing in ((torch.full((3, 3), math.nan), colors[:3]), (torch.zeros(0, 3), torch.zeros(0, 3))):
         assert build(SplatfactoCpuModelConfig(num_random=9), nothing).num_points == 9, "random ones"
+
+
+def test_a_short_training_densifies_by_gradient_alone():
+    """Rates begin (30,000 / steps) ** 0.5 times higher, and the gradient of densification rises by the root of that."""
+    config = splatfacto_cpu_config()
+    config.max_num_iterations = 1875
+    short = fitted_schedules(config)
+    assert short.pipeline.model.stop_screen_size_at == 0
+    assert short.pipeline.model.densify_grad_thresh == 2 * SplatfactoCpuModelConfig().densify_grad_thresh
+    assert short.optimizers["means"]["scheduler"].first == 4
+    config.pipeline.model.stop_screen_size_at = 7
+    assert fitted_schedules(config).pipeline.model.stop_screen_size_at == 7, "set by hand"
+    config.max_num_iterations = 30_000
+    config.pipeline.model = SplatfactoCpuModelConfig()
+    assert fitted_schedules(config).pipeline.model == SplatfactoCpuModelConfig()
 
 
 def test_black_seeds_start_from_random_colours_that_can_be_trained():
