@@ -34,7 +34,6 @@ from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.search import targets_of
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
@@ -168,8 +167,6 @@ def compact(
     seconds: float | None = None,
     photos: bool | str | Path = False,
     target_db: float | None = None,
-    target_ms: float | None = None,
-    target_mb: float | None = None,
     target_format: str = ".ply",
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
@@ -183,9 +180,6 @@ def compact(
     scene, for the duration of ``effort`` or ``seconds``. No photos are needed. A refinement or repair that harms
     pictures of any size is left out.
 
-    With targets, a search chooses count, SH degree and repair: the smallest file that reaches ``target_db`` within the
-    limits of time and size; without ``target_db``, the best scene within the limits.
-
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the budget
@@ -198,21 +192,19 @@ def compact(
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on photos, named as for :func:`prune`, by 1200 ("quick") or 12000 ("thorough") steps, or for
             ``seconds``.
-        target_db: least PSNR of the file against the given scene's renders, over the pixels that it covers, dB.
-        target_ms: longest time of a frame, milliseconds, drawn by this package.
-        target_mb: largest file, in units of 10^6 bytes.
-        target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
+        target_db: in place of ``keep``, least PSNR of the file, after all repairs, against the given scene's renders,
+            over the pixels that it covers, dB. The smallest such file is searched for.
+        target_format: format of the file whose size or PSNR counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
             there are more than twice as many; else it samples views.
         resolution, up, data, progress: as for :func:`prune`.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
-        ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`. ``.target`` is text on the
-        scene that meets the targets, and on the target that the next cheaper scene misses.
+        ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`.
 
     Raises:
-        BudgetError: if the budget cannot be met; for targets, the text tells the reachable values.
+        BudgetError: if the budget or the PSNR cannot be met; the text tells the reachable values.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
         PointSplatError: if the method or effort is unknown, or the time is negative.
@@ -225,10 +217,10 @@ def compact(
     """
     on_photos = photos is not False
     format_to_write(target_format)
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
-    looking = Looking(views, resolution, up, data, photos)
-    return compact_source(scene, request, targets, looking, progress)[1]
+    request = CompactRequest.of(
+        refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format, target_db
+    )
+    return compact_source(scene, request, Looking(views, resolution, up, data, photos), progress)[1]
 
 
 @normal_mode

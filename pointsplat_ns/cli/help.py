@@ -28,7 +28,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "tradeoff": (
         ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
-        ("the smallest scene of 32 dB", "pointsplat tradeoff room.ply --target-db 32 --json"),
+        ("two methods of pruning", "pointsplat tradeoff room.ply --by merge paper --repairs none -o methods"),
     ),
     "convert": (
         ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -21,7 +20,7 @@ from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.pages.film import with_labels
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import fit, read_png
+from pointsplat_ns.pages.pictures import picture_uri, read_png
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
@@ -56,11 +55,11 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
 
 def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
     """Write a page of all scenes before and after, with links to their files. Scenes that failed or are not finished
-    are listed. Raises SceneError if it cannot be written, and DataError if all pictures do not fit into 30 MB."""
-    drawn = {result.name: result for result in results if _pair(result) is not None}
-    pictures = [partial(_picture, result, side) for result in drawn.values() for side in (0, 1)]
-    uris = iter(fit(pictures, limit=30_000_000)[0])
-    scenes = [_facts(result, path, [next(uris) for _ in range(2 * (result.name in drawn))]) for result in results]
+    are listed. Raises SceneError if it cannot be written."""
+    scenes = []
+    for result in results:
+        sides = (0, 1) if _pair(result) is not None else ()
+        scenes.append(_facts(result, path, [picture_uri(_picture(result, side)) for side in sides]))
     done = [result for result in results if result.megabytes is not None]
     sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
     text = page(
