@@ -27,10 +27,6 @@ from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.levels.writing import LevelOutput
-from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.pages.stream_page import stream_page
-from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
@@ -235,7 +231,6 @@ def lod(
     data: str | Path | None = None,
     folder: str | Path | None = None,
     stream: bool = False,
-    html: bool = False,
     tiles: bool = False,
     at: str | None = None,
     force: bool = False,
@@ -255,7 +250,6 @@ def lod(
         folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`. A name that ends in
             .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
-        html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
         force: overwrite existing files in ``folder``.
 
@@ -267,7 +261,7 @@ def lod(
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
         DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown, or the viewer cannot be downloaded.
+        PointSplatError: if ``sh`` is unknown.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -277,21 +271,16 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    output = LevelOutput.of(folder, stream, tiles, html, at, up, force)
-    viewer = web_viewer() if html else None
+    output = LevelOutput.of(folder, stream, tiles, at, up, force)
     with ExitStack() as stack:
         if output is not None:
-            stack.enter_context(output.claim(len(budgets), tuple(viewer or ())))
+            stack.enter_context(output.claim(len(budgets)))
         dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
-        page = None
-        if viewer is not None and output is not None:
-            known = view_source.known(VIEW_COUNTS.opening)
-            page = stream_page(viewer, dense, known, up_named(up), output.path.resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
-        made = made if output is None else output.write(made, page, report)
-    log((*made.notes, *([page.note] if page else [])))
+        made = made if output is None else output.write(made, report)
+    log(made.notes)
     return made
 
 

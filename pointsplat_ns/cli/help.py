@@ -24,7 +24,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "lod": (
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
-        ("a stream with a page for the web", "pointsplat lod room.ply --stream --html -o page"),
+        ("a stream for viewers on the web", "pointsplat lod room.ply --stream -o page"),
     ),
     "tradeoff": (
         ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),

@@ -34,7 +34,6 @@ from pointsplat_ns.looking.closeness import DenseReference, Reference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
-from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, silent
@@ -143,16 +142,10 @@ class Levels:
         """
         write_levels(folder, self.scenes, *self._manifest(), *self._picture(), force)
 
-    def save_stream(
-        self,
-        folder: str | Path,
-        force: bool = False,
-        progress: Progress = silent,
-        page: StreamPage | None = None,
-    ) -> list[int]:
+    def save_stream(self, folder: str | Path, force: bool = False, progress: Progress = silent) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
-        return write_stream(folder, self.scenes, self.parents, force, progress, page)
+        return write_stream(folder, self.scenes, self.parents, force, progress)
 
     def save_paged(self, path: str | Path, progress: Progress = silent) -> int:
         """Write the levels as a RAD file, as ``pointsplat lod -o room.rad`` does; see

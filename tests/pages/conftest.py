@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import pytest
-from room_views import room_views
 
 import pointsplat_ns as ps
 from pointsplat_ns.gaussians import Gaussians
+from room_views import room_views
 
 
 @pytest.fixture(scope="session")

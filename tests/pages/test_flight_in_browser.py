@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from room_views import room_views
 
 import pointsplat_ns as ps
 from browser import before_pages_load, chromium, complaints, phone_and_colours
@@ -23,6 +22,7 @@ from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages.flight import FlightFrame
+from room_views import room_views
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from room_views import room_views
 
 import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
@@ -23,6 +22,7 @@ from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages import html
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.pictures import read_png
+from room_views import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
 
