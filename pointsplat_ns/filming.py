@@ -121,8 +121,7 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Viewer:
-    """Show a scene, or two scenes with the same camera, in the browser, which draws. Browsers without WebGL 2 show
-    pictures that this machine's processor draws.
+    """Show a scene, or two scenes with the same camera, in a browser with WebGL 2, which draws.
 
     It opens upright, at the known or sampled view that shows most of the scene, or at the whole of an object.
 
