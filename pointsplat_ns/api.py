@@ -247,7 +247,7 @@ def lod(
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
-        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`. A name that ends in
+        folder: output folder for the levels and a manifest; see :meth:`Levels.save`. A name that ends in
             .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
         tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.

@@ -43,10 +43,10 @@ def lod(
     Args:
         levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
-        output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
-            picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run. With
-            --stream, the folder for lod-meta.json and its SOG files, by default room_stream; with --tiles, that for
-            tileset.json and its glTF files, by default room_tiles. A name that ends in .rad is a file for Spark.
+        output: the folder for the levels (level_0.ply is the finest) and the manifest lod.json; by default beside the
+            scene: room_lod for room.ply, lod in the folder of a run. With --stream, the folder for lod-meta.json and
+            its SOG files, by default room_stream; with --tiles, that for tileset.json and its glTF files, by default
+            room_tiles. A name that ends in .rad is a file for Spark.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
         tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
         at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or the latitude,

@@ -33,7 +33,6 @@ class FolderFiles:
     scenes_lock: str = ".scenes.lock"
     levels: str = "lod.json"
     """Manifest of levels of detail."""
-    levels_picture: str = "lod.png"
 
 
 FOLDER_FILES = FolderFiles()

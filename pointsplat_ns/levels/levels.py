@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -35,7 +34,6 @@ from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, silent
 
 DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
@@ -131,7 +129,7 @@ class Levels:
         return iter(self.levels)
 
     def save(self, folder: str | Path, force: bool = False) -> None:
-        """Write every level, the manifest and the picture to a folder, as ``pointsplat lod`` does.
+        """Write every level and the manifest to a folder, as ``pointsplat lod`` does.
 
         Args:
             folder: created if it is missing.
@@ -140,7 +138,7 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        write_levels(folder, self.scenes, *self._manifest(), *self._picture(), force)
+        write_levels(folder, self.scenes, *self._manifest(), force)
 
     def save_stream(self, folder: str | Path, force: bool = False, progress: Progress = silent) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
@@ -211,22 +209,6 @@ class Levels:
         }
         bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
         return {"source": source, "bounds": bounds, "views": views}, [level.facts(len(dense)) for level in self]
-
-    @torch.no_grad()
-    def _picture(self) -> tuple[list[Tensor], list[str]]:
-        """Images and captions of the dense scene and of every level, in the view with the median error at the coarsest
-        level; none if there is no view."""
-        if self.reference is None:
-            return [], []
-        views = self.reference.views
-        index_of_view = int(np.argsort(self.reference.errors(self[-1].scene), kind="stable")[(len(views) - 1) // 2])
-        images, captions = [self.reference.renders[index_of_view]], [f"dense: {len(self.dense):,} Gaussians"]
-        for index, level in enumerate(self):
-            assert level.errors is not None
-            images.append(render(level.scene, views[index_of_view]))
-            share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            captions.append(f"level {index}: {len(level.scene):,} ({share})\n{level.errors.near}")
-        return images, captions
 
 
 def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.outputs import claimed, claimed_folder
-from pointsplat_ns.levels.folder import check_folder, check_level_folder
+from pointsplat_ns.levels.folder import check_folder, level_names
 from pointsplat_ns.levels.levels import Levels
 from pointsplat_ns.levels.tiles import TILESET
 from pointsplat_ns.system.progress import Progress
@@ -51,10 +51,8 @@ class LevelOutput:
         """Check that ``count`` levels can be written; no other program writes there while the context is open."""
         if self.form == "paged":
             return claimed(self.path, self.force)
-        if self.form == "folder":
-            check_level_folder(self.path, count, self.force)
-        else:
-            check_folder(self.path, (TILESET if self.form == "tiles" else STREAM_META,), self.force)
+        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[self.form]
+        check_folder(self.path, names, self.force)
         return claimed_folder(self.path)
 
     def write(self, levels: Levels, progress: Progress) -> Levels:

@@ -89,7 +89,7 @@ def test_the_manifest_is_true_of_the_files(folder, scene):
         "sh_degree": 1,
         "psnr_farther": manifest["source"]["psnr_farther"],  # recomputed below
     }
-    named = {"lod.json", "lod.png"}
+    named = {"lod.json"}
     for level, count in zip(manifest["levels"], (200, 100, 40, 12), strict=True):
         content = (folder / level["file"]).read_bytes()
         assert (level["bytes"], level["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
@@ -131,7 +131,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("where", [(Judge, "quality"), (level_folder, "write_ply"), (level_folder, "_draw")])
+@pytest.mark.parametrize("where", [(Judge, "quality"), (level_folder, "write_ply")])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scene, views, tmp_path, monkeypatch):
     def failing(*_, **__):
@@ -146,7 +146,7 @@ def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scen
     assert contents(tmp_path / "old") == before and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("taken", ["lod.json", "lod.png", "level_0.ply", "level_3.ply"])
+@pytest.mark.parametrize("taken", ["lod.json", "level_3.ply"])
 def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_path):
     (tmp_path / "other.txt").write_text("mine")
     (tmp_path / taken).write_text("precious")
