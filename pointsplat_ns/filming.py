@@ -145,7 +145,8 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    from pointsplat_ns.pages.viewer import ViewedScene, Viewer
+    from pointsplat_ns.pages.kept import ViewedScene
+    from pointsplat_ns.pages.viewer import Viewer
 
     upward = up_named(up)
     need_named_data(scene, data)
@@ -161,11 +162,8 @@ def open_viewer(
         run = None if index == 0 and without_poses(views) else source
         path = None if isinstance(source, Gaussians) else Path(source)
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
-        scenes.append(
-            ViewedScene(
-                _name(source, index), path, loaded, _source(run, loaded, given, None if index else data), levels
-            )
-        )
+        views_of = _source(run, loaded, given, None if index else data)
+        scenes.append(ViewedScene(_name(source, index), path, loaded, views_of, levels))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import Merger
-from pointsplat_ns.pruning import resolve_keep, select
+from pointsplat_ns.pruning import need_usable, resolve_keep, select
 from pointsplat_ns.pruning.coverage import coverage_score
 
 
@@ -34,16 +35,26 @@ class MergingStopped(Exception):
     """Raised in merging once a page has chosen another share."""
 
 
-class Levels:
-    """A scene at any share of its Gaussians, for several pages, whose requests have threads of their own. Merging is to
-    the count of ``pointsplat prune``, which gives its scene.
+class ViewedScene:
+    """A scene for the viewer, at any share of its Gaussians, for several pages, whose requests have threads of their
+    own. Merging is to the count of ``pointsplat prune``, which gives its scene.
 
-    Undrawable Gaussians are left out. ``there`` are smaller scenes that exist already, such as levels of a stream; each
-    stands for shares near its count. Merging uses the dataset's views of ``source``.
+    Undrawable Gaussians are left out; raises SceneError if nothing is left.
+
+    Args:
+        name: for people.
+        path: of the scene; None if it has none.
+        scene: N Gaussians.
+        source: source of views; merging uses those of its dataset.
+        there: smaller scenes that exist already, such as levels of a stream; each stands for shares near its count.
     """
 
-    def __init__(self, scene: Gaussians, source: ViewSource, there: Sequence[Gaussians] = ()):
-        self.scene = keep_usable(scene, "the scene")
+    def __init__(
+        self, name: str, path: Path | None, scene: Gaussians, source: ViewSource, there: Sequence[Gaussians] = ()
+    ):
+        need_usable(scene)
+        self.name, self.path, self.source = name, path, source
+        self.scene = keep_usable(scene, name)
         """All drawable Gaussians."""
         self.whole = Level(self.scene, "all")
         """The level of 100 %."""
@@ -51,7 +62,6 @@ class Levels:
         self._chosen: tuple[int, Level] = (100, self.whole)
         """The newest share that was chosen by coverage."""
         self._merged: dict[int, Level] = {}
-        self._source = source
         self._choices = 0
         """Number of choices of a share so far; each stops the merging to an older one."""
         self._merging = threading.Lock()
@@ -118,4 +128,4 @@ class Levels:
 
     @cached_property
     def _merger(self) -> Merger:
-        return Merger(self.scene, self._source.for_merging())
+        return Merger(self.scene, self.source.for_merging())

@@ -9,20 +9,18 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.kept import Level, Levels
+from pointsplat_ns.pages.kept import Level, ViewedScene
 from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
 
@@ -35,20 +33,6 @@ LARGEST_FILE = 4_000_000_000
 """Largest file that may be dropped, bytes."""
 
 
-@dataclass(frozen=True, eq=False)
-class ViewedScene:
-    """A scene for the viewer."""
-
-    name: str
-    path: Path | None
-    """Path of the scene; None if it has none."""
-    scene: Gaussians
-    source: ViewSource
-    """Source of views."""
-    levels: Sequence[Gaussians] = ()
-    """Smaller scenes that are there already, as of :class:`~pointsplat_ns.pages.kept.Levels`."""
-
-
 class _Stage:
     """The scenes that are shown, from where, and at which shares."""
 
@@ -59,7 +43,6 @@ class _Stage:
         self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin
-        self.levels = [Levels(viewed.scene, viewed.source, viewed.levels) for viewed in scenes]
         shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]
         if len(scenes) == 1:
             shown.append({"name": "all of it", "amount": ""})
@@ -68,8 +51,8 @@ class _Stage:
 
     def state(self, index: int, percent: int, level: Level, whole: bool) -> dict[str, Any]:
         """What a page says of a level, with the command that makes it; ``whole`` if no better one comes."""
-        viewed, levels, command = self.scenes[index], self.levels[index], ""
-        amount = f"{len(levels.scene):,} Gaussians"
+        viewed, command = self.scenes[index], ""
+        amount = f"{len(viewed.scene):,} Gaussians"
         if percent < 100:
             amount = f"{len(level.scene):,} of {amount}, {level.how}" + ("" if whole else ", merging ...")
             if viewed.path is not None:
@@ -78,8 +61,8 @@ class _Stage:
 
     def close(self, timeout: float) -> None:
         """Stop merging, and wait for it at most ``timeout`` seconds."""
-        for levels in self.levels:
-            levels.close(timeout)
+        for viewed in self.scenes:
+            viewed.close(timeout)
 
 
 class Viewer:
@@ -156,17 +139,17 @@ class Viewer:
         if stage is None or wanted["stage"] != stage.number:
             return Answer(status=HTTPStatus.CONFLICT)
         index, percent, have = int(wanted["scene"]), _percent(wanted["percent"]), str(wanted["have"])
-        levels = dict(enumerate(stage.levels))[index]
+        viewed = dict(enumerate(stage.scenes))[index]
         if not have:
-            levels.stop()
-        level = (levels.merged(percent) if have else None) or levels.at(percent)
-        whole = levels.ready(percent) is level
+            viewed.stop()
+        level = (viewed.merged(percent) if have else None) or viewed.at(percent)
+        whole = viewed.ready(percent) is level
         headers = {"X-State": json.dumps(stage.state(index, percent, level, whole))}
         if level.how == have or not wanted["spz"]:
             return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
         with self._working:
             # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
-            level.spz = level.spz or stage.frame.encoded(level.scene, stage.scenes[index].name, level=1)
+            level.spz = level.spz or stage.frame.encoded(level.scene, viewed.name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
 
     def _drop(self, request: Request) -> Answer:

@@ -89,6 +89,16 @@ def measure_tradeoff(
         DataError: if there is no view, or most of those of ``poses`` see nothing of the scene.
         PointSplatError: if there is no such method or repair, or a number means nothing.
         KeyboardInterrupt: after the results of an interrupted measurement were written.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
+        ...     options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
+        ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
+        >>> [point.key for point in found.points]
+        ['dense', '10pct']
     """
     check_options(keep, by, repairs, within, views)
     path, folder = Path(scene), Path(folder)

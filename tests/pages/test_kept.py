@@ -11,7 +11,7 @@ import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import kept as module
-from pointsplat_ns.pages.kept import Levels
+from pointsplat_ns.pages.kept import ViewedScene
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,8 @@ def scene() -> ps.Gaussians:
 
 
 @pytest.fixture()
-def levels(scene) -> Iterator[Levels]:
-    made = Levels(scene, ViewSource(scene))
+def levels(scene) -> Iterator[ViewedScene]:
+    made = ViewedScene("ball", None, scene, ViewSource(scene))
     yield made
     made.close(5.0)
 
@@ -31,12 +31,11 @@ def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp
     shown = []
     monkeypatch.setattr("pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
     ps.open_viewer(tmp_path / "room")
-    (viewed,) = shown
-    made = Levels(viewed.scene, viewed.source, viewed.levels)
+    (made,) = shown
     for percent, how in ((50, "level 1 of the stream"), (10, "level 2 of the stream"), (30, "chosen by coverage")):
         level = made.at(percent)
         assert level.how == how and made.ready(percent) is (None if percent == 30 else level)
-        assert len(level.scene) == pytest.approx(percent * len(viewed.scene) / 100, rel=0.1)
+        assert len(level.scene) == pytest.approx(percent * len(made.scene) / 100, rel=0.1)
     made.close(5.0)
 
 
@@ -90,6 +89,6 @@ def test_merged_levels_together_take_no_more_than_the_scene(levels, monkeypatch)
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(scene):
     broken = scene.replace(means=scene.means.index_fill(0, torch.tensor([0, 7]), torch.nan))
-    made = Levels(broken, ViewSource(broken))
+    made = ViewedScene("ball", None, broken, ViewSource(broken))
     made.close(5.0)
     assert len(made.scene) == 398

@@ -137,7 +137,7 @@ HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999\nprope
         ("a.spz", b"\x1f\x8b" + bytes(50), "a.spz: "),
         ("a.sog", b"PK\x03\x04" + bytes(50), "a.sog: "),
         ("a.ckpt", b"cos\nsystem\n(S'touch pwned'\ntR.", "a.ckpt: "),
-        ("a.splat", struct.pack("<8f", *[float("nan")] * 8), "nothing of the scene can be seen"),
+        ("a.splat", struct.pack("<8f", *[float("nan")] * 8), "no Gaussians that can be drawn"),
         ("config.yml", b"!!python/object/apply:os.system [touch pwned]", "not a scene"),
     ],
 )
