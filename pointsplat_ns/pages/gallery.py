@@ -56,14 +56,11 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
 def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
     """Write a page of all scenes before and after, with links to their files. Scenes that failed or are not finished
     are listed. Raises SceneError if it cannot be written."""
-    scenes = []
-    for result in results:
-        sides = (0, 1) if _pair(result) is not None else ()
-        scenes.append(_facts(result, path, [picture_uri(_picture(result, side)) for side in sides]))
+    scenes = [_facts(result, path) for result in results]
     done = [result for result in results if result.megabytes is not None]
     sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
     text = page(
-        "gallery.html", title=title, scenes=scenes, done=len(done), width=WIDTH, height=HEIGHT,
+        "gallery.html", title=title, scenes=scenes, done=len(done), width=2 * WIDTH, height=HEIGHT,
         sizes=[bytes_text(1e6 * size) for size in sizes],
     )  # fmt: skip
     with replacing(path) as part:
@@ -79,10 +76,13 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
     height, width = HEIGHT // step, 2 * WIDTH // step
     sheet = np.full((max(1, math.ceil(len(drawn) / columns)) * height, columns * width, 3), 255, np.uint8)
     for index, result in enumerate(drawn):
-        pair = np.concatenate([_picture(result, side)[: height * step : step, ::step] for side in (0, 1)], axis=1)
+        pair = _pair(result)
+        if pair is None:  # it has gone meanwhile
+            continue
         before, after = _sizes(result)
         row, column = divmod(index, columns)
-        labelled = with_labels(pair[:, :width], (f"{result.name}: {before}", after), width // 2)
+        small = pair[: height * step : step, ::step][:, :width]
+        labelled = with_labels(small, (f"{result.name}: {before}", after), width // 2)
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = labelled
     write_picture(torch.from_numpy(sheet) / 255, path)
 
@@ -93,12 +93,6 @@ def _pair(result: SceneResult) -> np.ndarray | None:
         return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
     except DataError:
         return None
-
-
-def _picture(result: SceneResult, side: int) -> np.ndarray:
-    """The picture of a scene before (0) or after (1); black if it has gone meanwhile."""
-    pair = _pair(result)
-    return np.zeros((HEIGHT, WIDTH, 3), np.uint8) if pair is None else pair[:, side * WIDTH : (side + 1) * WIDTH]
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:
@@ -112,12 +106,12 @@ def _sizes(result: SceneResult) -> tuple[str, str]:
     return before, after
 
 
-def _facts(result: SceneResult, path: Path, pictures: list[str]) -> dict[str, Any]:
+def _facts(result: SceneResult, path: Path) -> dict[str, Any]:
     """What the page at a path says of a scene."""
-    finished = result.megabytes is not None
+    finished, pair = result.megabytes is not None, _pair(result)
     said = str(result) if finished else result.error or "not finished"
     link = quote(Path(os.path.relpath(result.output, path.parent)).as_posix()) if finished else ""
     return {
-        "name": result.name, "file": Path(result.output).name, "link": link, "pictures": pictures,
-        "sizes": _sizes(result), "failed": bool(result.error), "said": said,
+        "name": result.name, "file": Path(result.output).name, "link": link, "sizes": _sizes(result),
+        "picture": None if pair is None else picture_uri(pair), "failed": bool(result.error), "said": said,
     }  # fmt: skip

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
@@ -103,7 +104,8 @@ class Viewer:
 
     def wait(self) -> None:
         """Wait until Ctrl-C."""
-        threading.Event().wait()
+        while True:  # a signal that another thread got is seen when this one wakes
+            time.sleep(0.5)
 
     def __enter__(self) -> Viewer:
         return self
