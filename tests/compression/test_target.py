@@ -48,6 +48,7 @@ def test_the_file_that_is_written_has_the_quality_and_few_gaussians(dense, views
     assert said.psnr >= 25
     reached = f"{decibels(said.psnr)} against the dense scene in 3 views of 48 x 36 pixels"
     assert found.target.startswith(f"{reached}, {bytes_text(path.stat().st_size)}, {len(found.scene):,} Gaussians; ")
+    assert (found.stages[-1].name == "round") == (suffix != ".ply")
     fewer = ps.compact(dense, round(0.85 * len(found.scene)), by="opacity")  # which is not rounded
     assert quality_of_file(dense, ViewSource(dense), fewer.scene, None, suffix).psnr < 25
 
