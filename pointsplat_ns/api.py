@@ -266,7 +266,7 @@ def lod(
     Example:
         >>> import pointsplat_ns as ps
         >>> levels = ps.lod(ps.example_room()[::20], ["50%", "25%", 100])
-        >>> [(len(level.scene), level.errors.near.psnr > 10) for level in levels]
+        >>> [(len(level.scene), level.quality.psnr > 10) for level in levels]
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read

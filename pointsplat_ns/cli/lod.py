@@ -86,7 +86,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
     rows = []
     for index, level in enumerate(made):
-        near = level.errors and level.errors.near
+        near = level.quality
         rows.append(
             (
                 f"level_{index}",

@@ -58,7 +58,7 @@ def write_levels(
             part = part_of(name)
             write_ply(scene, part)
             rows.append({"file": name, "bytes": part.stat().st_size, "sha256": content_hash(part), **fact})
-        write_json({"format": "pointsplat-lod", "version": 1, **about, "levels": rows}, manifest)
+        write_json({"format": "pointsplat-lod", "version": 2, **about, "levels": rows}, manifest)
         (folder / FOLDER_FILES.levels).unlink(missing_ok=True)
 
 

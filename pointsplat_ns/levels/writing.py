@@ -73,8 +73,6 @@ def _read_back(levels: Levels, folder: Path) -> Levels:
     """Levels, judged as they are in a stream."""
     judged = []
     for index, level in enumerate(levels):
-        errors = level.errors
-        if levels.judge is not None and errors is not None:
-            errors = replace(errors, near=levels.judge.quality(read_sog_stream(folder, index)))
-        judged.append(replace(level, errors=errors))
+        quality = None if levels.judge is None else levels.judge.quality(read_sog_stream(folder, index))
+        judged.append(replace(level, quality=quality))
     return replace(levels, levels=tuple(judged))
