@@ -27,14 +27,9 @@ from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
 from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
 from pointsplat_ns.levels.writing import LevelOutput
-from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
-from pointsplat_ns.pages.stream_page import stream_page
-from pointsplat_ns.pages.web_viewer import web_viewer
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.search import targets_of
 from pointsplat_ns.views import Views
 
 EXAMPLE = Path(__file__).parent / "examples" / "room.ply"
@@ -168,8 +163,6 @@ def compact(
     seconds: float | None = None,
     photos: bool | str | Path = False,
     target_db: float | None = None,
-    target_ms: float | None = None,
-    target_mb: float | None = None,
     target_format: str = ".ply",
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
@@ -183,9 +176,6 @@ def compact(
     scene, for the duration of ``effort`` or ``seconds``. No photos are needed. A refinement or repair that harms
     pictures of any size is left out.
 
-    With targets, a search chooses count, SH degree and repair: the smallest file that reaches ``target_db`` within the
-    limits of time and size; without ``target_db``, the best scene within the limits.
-
     Args:
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         keep: size of the result, as for :func:`prune`; an "auto" PSNR is reached before repairs. By default the budget
@@ -198,21 +188,19 @@ def compact(
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
         photos: also train on photos, named as for :func:`prune`, by 1200 ("quick") or 12000 ("thorough") steps, or for
             ``seconds``.
-        target_db: least PSNR of the file against the given scene's renders, over the pixels that it covers, dB.
-        target_ms: longest time of a frame, milliseconds, drawn by this package.
-        target_mb: largest file, in units of 10^6 bytes.
-        target_format: format of the file whose size counts: ".ply", ".spz", ".sog", ...
+        target_db: in place of ``keep``, least PSNR of the file, after all repairs, against the given scene's renders,
+            over the pixels that it covers, dB. The smallest such file is searched for.
+        target_format: format of the file whose size or PSNR counts: ".ply", ".spz", ".sog", ...
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used. The repair uses the others if
             there are more than twice as many; else it samples views.
         resolution, up, data, progress: as for :func:`prune`.
 
     Returns:
         ``.scene``, ``.accepted`` (whether the refiner is in it), ``.psnr`` (dB against the given scene's renders),
-        ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`. ``.target`` is text on the
-        scene that meets the targets, and on the target that the next cheaper scene misses.
+        ``.seconds``, ``.verdict`` (text on the gains), and more: see :class:`Compacted`.
 
     Raises:
-        BudgetError: if the budget cannot be met; for targets, the text tells the reachable values.
+        BudgetError: if the budget or the PSNR cannot be met; the text tells the reachable values.
         SceneError: if no Gaussian can be drawn, the file is not usable, or the SH degree exceeds the refiner's.
         DataError: if the budget or ``sh`` needs views and there are none.
         PointSplatError: if the method or effort is unknown, or the time is negative.
@@ -225,10 +213,10 @@ def compact(
     """
     on_photos = photos is not False
     format_to_write(target_format)
-    request = CompactRequest.of(refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format)
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, on_photos)
-    looking = Looking(views, resolution, up, data, photos)
-    return compact_source(scene, request, targets, looking, progress)[1]
+    request = CompactRequest.of(
+        refiner, keep, by, sh, clean, RepairBudget(effort, seconds), on_photos, target_format, target_db
+    )
+    return compact_source(scene, request, Looking(views, resolution, up, data, photos), progress)[1]
 
 
 @normal_mode
@@ -243,7 +231,6 @@ def lod(
     data: str | Path | None = None,
     folder: str | Path | None = None,
     stream: bool = False,
-    html: bool = False,
     tiles: bool = False,
     at: str | None = None,
     force: bool = False,
@@ -260,10 +247,9 @@ def lod(
         sh: SH bands of every level, as for :func:`prune`.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
-        folder: output folder for the levels, a manifest and a picture; see :meth:`Levels.save`. A name that ends in
+        folder: output folder for the levels and a manifest; see :meth:`Levels.save`. A name that ends in
             .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
-        html: write the SuperSplat viewer's page beside the stream, which is turned until -y is up.
         tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
         force: overwrite existing files in ``folder``.
 
@@ -275,31 +261,26 @@ def lod(
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
         DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown, or the viewer cannot be downloaded.
+        PointSplatError: if ``sh`` is unknown.
 
     Example:
         >>> import pointsplat_ns as ps
         >>> levels = ps.lod(ps.example_room()[::20], ["50%", "25%", 100])
-        >>> [(len(level.scene), level.errors.near.psnr > 10) for level in levels]
+        >>> [(len(level.scene), level.quality.psnr > 10) for level in levels]
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    output = LevelOutput.of(folder, stream, tiles, html, at, up, force)
-    viewer = web_viewer() if html else None
+    output = LevelOutput.of(folder, stream, tiles, at, up, force)
     with ExitStack() as stack:
         if output is not None:
-            stack.enter_context(output.claim(len(budgets), tuple(viewer or ())))
+            stack.enter_context(output.claim(len(budgets)))
         dense, view_source = read_source(scene, Looking(views, resolution, up, data))
         source = None if isinstance(scene, Gaussians) else source_file(scene)
-        page = None
-        if viewer is not None and output is not None:
-            known = view_source.known(VIEW_COUNTS.opening)
-            page = stream_page(viewer, dense, known, up_named(up), output.path.resolve().name)
         report = stack.enter_context(progress_bar(progress))
         made = make_levels(dense, levels, sh, view_source, source, report)
-        made = made if output is None else output.write(made, page, report)
-    log((*made.notes, *([page.note] if page else [])))
+        made = made if output is None else output.write(made, report)
+    log(made.notes)
     return made
 
 

@@ -22,7 +22,6 @@ from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.photo_repair import Photos
-    from pointsplat_ns.tradeoff.search import Targets
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -154,32 +153,26 @@ def clean_source(
 def compact_source(
     scene: Source,
     request: CompactRequest,
-    targets: Targets | None,
     looking: Looking,
     progress: bool | Progress = False,
 ) -> tuple[Gaussians, Compacted, ViewSource]:
-    """Read a scene and compact it, or search for targets; verdicts and notes are logged as details. A search uses only
-    method, refiner, effort and format of the request, and decides the rest.
+    """Read a scene and compact it; verdicts and notes are logged as details.
 
     Returns:
         The dense scene, the result, and the source of its views, to judge it in.
     """
     dense, source, photos = _read_photographed(scene, looking, progress)
     with progress_bar(progress) as report:
-        if targets is None:
+        if request.target_db is None:
             from pointsplat_ns.compression.compact import compact_scene
 
             result = compact_scene(dense, request, source, report, photos.training)
         else:
-            from pointsplat_ns.tradeoff.making import subject_of
-            from pointsplat_ns.tradeoff.points import repairs_of
-            from pointsplat_ns.tradeoff.search import find_scene
+            from pointsplat_ns.compression.target_search import compact_to_psnr
 
-            run, size, upward, data = looking.run_of(scene), looking.size, looking.upward, looking.data
-            subject = subject_of(dense, run, source.given, request.refiner, request.prune.suffix, size, upward, data)
-            result = find_scene(subject, targets, request.prune.by, repairs_of(request.repair.effort), report)
+            result = compact_to_psnr(dense, request, source, report)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
-    log(tuple(result.target.splitlines()))
+    log(tuple(filter(None, [result.target])))
     trained = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), None)
     _log_held_out(dense, (last_kept(result.stages[:trained]).scene, result.scene), photos)
     return dense, result, source

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
-from pointsplat_ns.pages.camera_path import CAMERA_PATH, FilmSettings, camera_path
+from pointsplat_ns.pages.camera_path import FPS, PHOTO_SIDE, FilmSettings, camera_path
 from pointsplat_ns.pages.film import SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
 from pointsplat_ns.system.progress import Progress, tracked
@@ -38,7 +37,6 @@ def render_path(
     path: str | Path | None = None,
     views: Views | str | Path | None = None,
     split: SplitScreen = "side-by-side",
-    labels: Sequence[str] | None = None,
     up: str | None = None,
     data: str | Path | None = None,
     width: int | None = None,
@@ -54,13 +52,12 @@ def render_path(
         scene: N Gaussians, or the path of a scene.
         output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
             when it is complete.
-        other: a second scene in the same frame, to compare with.
+        other: a second scene in the same frame, to compare with. Both are labelled with their names and counts.
         path: a camera path that nerfstudio's viewer saved (JSON). By default the film goes exactly through the views
             or the poses of the run's dataset; without these around an object, or past what shows most of a room.
         views: views to go through, in place of the dataset's poses: views, or a file of cameras (``cameras.json`` of
             3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
         split: layout of two scenes: "side-by-side", or "wipe" with a moving line between them.
-        labels: labels of two scenes; by default their names and counts. An empty list writes none.
         up: the axis that is up in the scene ("z", "-y") for a film without views; by default the scene's own, or
             estimated.
         data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
@@ -98,16 +95,15 @@ def render_path(
     sources = [scene] if other is None else [scene, other]
     first, given = _with_views(scene, NO_POSES if views is None and path is not None else views)
     if given is not None and not isinstance(views, Views):  # from a file, as large as its photos
-        given = given.resized(CAMERA_PATH.photo_side)
+        given = given.resized(PHOTO_SIDE)
     loaded = [first if source is scene else _loaded(source).at_offset(first.offset) for source in sources]
     if given is not None and kind == "frames" and seconds is None and path is None:
-        settings = replace(settings, seconds=max(1, len(given)) / (fps or CAMERA_PATH.fps))
+        settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
     view_source = _source(None if without_poses(views) else scene, first, given, data)
     chosen = camera_path(loaded[0], view_source, path, settings, kind == "picture", upward)
-    if labels is None:
-        labels = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
+    names = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
     logger.info("%d x %d pixels: %s", chosen.views.width, chosen.views.height, chosen.origin)
-    frames = render_frames(loaded, chosen.views, chosen.fps, split, labels if len(loaded) > 1 else ())
+    frames = render_frames(loaded, chosen.views, chosen.fps, split, names if len(loaded) > 1 else ())
     return write_frames(tracked(frames, "rendering", len(chosen.views), progress), output, chosen.fps, force)
 
 
@@ -121,8 +117,7 @@ def open_viewer(
     host: str = "127.0.0.1",
     port: int = 7007,
 ) -> Viewer:
-    """Show a scene, or two scenes with the same camera, in the browser, which draws. Browsers without WebGL 2 show
-    pictures that this machine's processor draws.
+    """Show a scene, or two scenes with the same camera, in a browser with WebGL 2, which draws.
 
     It opens upright, at the known or sampled view that shows most of the scene, or at the whole of an object.
 
@@ -150,7 +145,8 @@ def open_viewer(
         ...     viewer.url.startswith("http://127.0.0.1:")
         True
     """
-    from pointsplat_ns.pages.viewer import ViewedScene, Viewer
+    from pointsplat_ns.pages.kept import ViewedScene
+    from pointsplat_ns.pages.viewer import Viewer
 
     upward = up_named(up)
     need_named_data(scene, data)
@@ -166,11 +162,8 @@ def open_viewer(
         run = None if index == 0 and without_poses(views) else source
         path = None if isinstance(source, Gaussians) else Path(source)
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
-        scenes.append(
-            ViewedScene(
-                _name(source, index), path, loaded, _source(run, loaded, given, None if index else data), levels
-            )
-        )
+        views_of = _source(run, loaded, given, None if index else data)
+        scenes.append(ViewedScene(_name(source, index), path, loaded, views_of, levels))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 

@@ -15,6 +15,7 @@ from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import judge_of
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
+from pointsplat_ns.compression.target_search import compact_to_psnr
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -36,11 +37,8 @@ from pointsplat_ns.scene_folder import (
     output_folder,
     run_on_folder,
 )
-from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.making import subject_of
-from pointsplat_ns.tradeoff.points import repairs_of
-from pointsplat_ns.tradeoff.search import Targets, find_scene, targets_of
 
 
 @normal_mode
@@ -56,8 +54,6 @@ def compact_folder(
     effort: Effort = "quick",
     seconds: float | None = None,
     target_db: float | None = None,
-    target_ms: float | None = None,
-    target_mb: float | None = None,
     resolution: tuple[int, int] | str | None = None,
     data: str | Path | None = None,
     target_format: str | None = None,
@@ -82,7 +78,7 @@ def compact_folder(
         refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
         by, sh, clean, effort: as for :func:`compact`.
         seconds: duration of the repair of each scene, as for :func:`compact`.
-        target_db, target_ms, target_mb: as for :func:`compact`, for each scene in the format of its result.
+        target_db: as for :func:`compact`, for each scene in the format of its result.
         resolution: as for :func:`prune`.
         data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
             data is not found gets sampled views, and a note.
@@ -118,9 +114,8 @@ def compact_folder(
     folder = Path(folder)
     target = output_folder(folder, "compact") if output is None else Path(output)
     size, trained = parse_resolution(resolution), _loaded(refiner)
-    request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds))
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds)
-    make = _Compacting(request.prune, size, data, target_format, refiner, request.repair, targets)
+    request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db)
+    make = _Compacting(request.prune, size, data, target_format, refiner, request.repair, target_db)
     options = {
         **make.options(),
         "refiner": None if trained is None else source_file(trained.source).sha256,
@@ -128,8 +123,8 @@ def compact_folder(
         "seconds": seconds,
         **({} if target_format is None else {"format": target_format}),
     }
-    if targets is not None:
-        options |= {"keep": None, "target_db": target_db, "target_ms": target_ms, "target_mb": target_mb}
+    if target_db is not None:
+        options |= {"keep": None, "target_db": target_db}
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
     again = force or (target / FOLDER_FILES.scenes).exists()
     for path, end in ((page, ".html"), (sheet, ".png")):
@@ -233,21 +228,17 @@ class _Pruning:
 
 @dataclass(frozen=True)
 class _Compacting(_Pruning):
-    """Compacts the scenes of a folder, or finds the cheapest version of each that meets targets."""
+    """Compacts the scenes of a folder."""
 
     refiner: str | Path | None
     """Loaded by each process."""
     repair: RepairBudget
-    targets: Targets | None
+    target_db: float | None
 
     def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource, path: Path) -> Gaussians:
         """The compact scene."""
-        trained = _loaded(self.refiner)
-        if self.targets is None:
-            result = compact_scene(dense, CompactRequest(request, trained, self.repair), source)
-        else:
-            subject = subject_of(dense, path, None, trained, request.suffix, self.resolution, data=self.data)
-            result = find_scene(subject, self.targets, request.by, repairs_of(self.repair.effort), silent)
+        whole = CompactRequest(request, _loaded(self.refiner), self.repair, target_db=self.target_db)
+        result = (compact_scene if self.target_db is None else compact_to_psnr)(dense, whole, source)
         if result.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         return result.scene

@@ -146,21 +146,6 @@ def no_lpips(tmp_path_factory, monkeypatch):
 
 
 @pytest.fixture()
-def plain_page(monkeypatch) -> list[Path]:
-    """In place of the page of a sweep, which takes seconds, a file that names its points; the folders it was asked
-    for."""
-    asked: list[Path] = []
-
-    def write_sweep_page(sweep, folder: Path, output: Path, flight=None, progress=None) -> Path:
-        asked.append(folder)
-        output.write_text(" ".join(point.key for point in sweep.points))
-        return output
-
-    monkeypatch.setattr("pointsplat_ns.tradeoff.page.write_sweep_page", write_sweep_page)
-    return asked
-
-
-@pytest.fixture()
 def some_lpips(request, monkeypatch) -> bool:
     """LPIPS from the weights at hand; without them, none and no attempt at a download. Says which."""
     if LPIPS_WEIGHTS.exists():

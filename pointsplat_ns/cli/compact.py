@@ -40,8 +40,6 @@ def compact(
     seconds: float | None = None,
     photos: options.Photos = False,
     target_db: float | None = None,
-    target_ms: float | None = None,
-    target_mb: options.Megabytes | None = None,
     poses: options.Poses = None,
     resolution: options.Resolution = None,
     up: options.Up = None,
@@ -72,7 +70,7 @@ def compact(
             folder; by default rooms_compact beside rooms. Each result there has the format of its scene.
         goal: the purpose, in place of --keep and the format: web (a .sog of 2 MB, and a page with the scene to paste
             into another), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of at most 400,000), email (an
-            .spz of 5 MB, and a page that opens with a double click). --keep, targets and --html replace its parts.
+            .spz of 5 MB, and a page that opens with a double click). --keep, --target-db and --html replace its parts.
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
             default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
@@ -87,11 +85,8 @@ def compact(
         photos: after the repair also train on photos, by 1200 steps (quick) or 12000 (thorough), or for --seconds.
             Photos in and outside of the steps say whether it helped. For a run, those of its dataset; for any scene,
             those in FOLDER, with the poses of --poses, or of a file of cameras there, above it or beside the scene.
-        target_db: search for the smallest file of at least this PSNR against renders of the dense scene. The search
-            chooses count, SH degree and repair, in place of --keep and --sh. By default there is no search.
-        target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
-            within the limits.
-        target_mb: largest file, in the format of the output: 12, 12MB, 800kB; by default no limit.
+        target_db: in place of --keep, the smallest file that has at least this PSNR against renders of the dense scene,
+            after all repairs; by default none is searched for.
         picture: a .png file for images of some views: dense, before and after the repair, side by side; for a
             folder, all scenes before and after; by default none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
@@ -103,9 +98,9 @@ def compact(
     from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.system.threads import fixed_threads
 
-    chosen, targeted = GOALS[goal], (target_db, target_ms, target_mb) != (None, None, None)
-    unasked = goal is None and keep is None and refiner is None and not targeted
-    keep = chosen.keep if keep is None and not targeted else keep
+    chosen = GOALS[goal]
+    unasked = goal is None and keep is None and refiner is None and target_db is None
+    keep = chosen.keep if keep is None and target_db is None else keep
     if is_folder_of_scenes(scene):
         from pointsplat_ns.scene_folder import output_folder
 
@@ -113,8 +108,8 @@ def compact(
         return folder_command(
             ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
             keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-            target_db=target_db, target_ms=target_ms, target_mb=target_mb, resolution=resolution, data=data,
-            target_format=chosen.suffix, html=html, picture=picture, force=force,
+            target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
+            picture=picture, force=force,
         )  # fmt: skip
     options.need_no_jobs(scene, jobs)
     from pointsplat_ns.compacting import Looking, compact_source
@@ -123,7 +118,6 @@ def compact(
     from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.runs import name_of
-    from pointsplat_ns.tradeoff.search import targets_of
 
     options.check_poses(poses)
     output = file_for(goal, scene, output)
@@ -133,12 +127,19 @@ def compact(
     options.claim_outputs(written, force, picture, html)
     kind = format_to_write(output)
     request = CompactRequest.of(
-        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
+        refiner_at(refiner),
+        keep,
+        by,
+        sh,
+        clean,
+        RepairBudget(effort, seconds),
+        bool(photos),
+        kind.budget_suffix,
+        target_db,
     )
-    targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
     looking = Looking(poses, resolution, up, data, photos)
     with fixed_threads(threads):
-        dense, result, source = compact_source(scene, request, targets, looking, progress=True)
+        dense, result, source = compact_source(scene, request, looking, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
     with options.scene_written(written):

@@ -24,11 +24,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "lod": (
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
-        ("a stream with a page for the web", "pointsplat lod room.ply --stream --html -o page"),
+        ("a stream for viewers on the web", "pointsplat lod room.ply --stream -o page"),
     ),
     "tradeoff": (
         ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
-        ("the smallest scene of 32 dB", "pointsplat tradeoff room.ply --target-db 32 --json"),
+        ("two methods of pruning", "pointsplat tradeoff room.ply --by merge paper --repairs none -o methods"),
     ),
     "convert": (
         ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,6 @@ def lod(
     levels: tuple[str, ...] = ("50%", "25%", "10%", "3%"),
     output: options.Output = None,
     stream: bool = False,
-    html: bool = False,
     tiles: bool = False,
     at: str | None = None,
     sh: options.Bands = "all",
@@ -36,7 +34,7 @@ def lod(
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
 
     With --stream, the whole scene and these levels are written as a streamed SOG, of which viewers load the parts that
-    they need; with --html besides, a viewer for the web beside it. With --tiles, they are written as 3D Tiles.
+    they need. With --tiles, they are written as 3D Tiles.
 
     Each level is merged from the one before, so that every Gaussian has one parent in the next coarser level. Renders
     are compared with the dense scene's, from --poses, else from the poses of the run's dataset if it is found, else
@@ -45,14 +43,11 @@ def lod(
     Args:
         levels: sizes of the levels, in any order: ratios (0.3), percentages (30%), counts (50000) or sizes of the
             file (12MB).
-        output: the folder for the levels (level_0.ply is the finest), their parents, the manifest lod.json and the
-            picture lod.png; by default beside the scene: room_lod for room.ply, lod in the folder of a run. With
-            --stream, the folder for lod-meta.json and its SOG files, by default room_stream; with --tiles, that for
-            tileset.json and its glTF files, by default room_tiles. A name that ends in .rad is a file for Spark.
+        output: the folder for the levels (level_0.ply is the finest) and the manifest lod.json; by default beside the
+            scene: room_lod for room.ply, lod in the folder of a run. With --stream, the folder for lod-meta.json and
+            its SOG files, by default room_stream; with --tiles, that for tileset.json and its glTF files, by default
+            room_tiles. A name that ends in .rad is a file for Spark.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
-        html: write PlayCanvas' SuperSplat viewer beside the stream, which is turned until -y is up, as viewers show
-            it. Any web server can serve the folder. The viewer (npm, MIT, 3 MB) is downloaded, or comes from the
-            tarball that the environment variable POINTSPLAT_WEB_VIEWER names.
         tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
         at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or the latitude,
             longitude and height of its origin in degrees and metres (48.86,2.29,35; --at=-33.9,... in the south), with
@@ -72,7 +67,7 @@ def lod(
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            data=data, folder=folder, stream=stream, html=html, tiles=tiles, at=at, force=force, progress=True,
+            data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force, progress=True,
         )  # fmt: skip
     if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
@@ -80,10 +75,6 @@ def lod(
         print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})
     else:
         _print_table(made, folder)
-        if html:
-            print(
-                f"{shlex.join(['python', '-m', 'http.server', '-d', str(folder)])} serves it at http://localhost:8000"
-            )
 
 
 def _print_table(made: Levels, folder: Path) -> None:
@@ -95,7 +86,7 @@ def _print_table(made: Levels, folder: Path) -> None:
     apart = (folder / FOLDER_FILES.levels).exists()  # each level has a PLY of its own
     rows = []
     for index, level in enumerate(made):
-        near = level.errors and level.errors.near
+        near = level.quality
         rows.append(
             (
                 f"level_{index}",

@@ -20,7 +20,6 @@ def render(
     path: Path | None = None,
     poses: options.Poses = None,
     split: Literal["side-by-side", "wipe"] = "side-by-side",
-    labels: tuple[str, ...] | None = None,
     up: options.Up = None,
     data: options.Data = None,
     width: int | None = None,
@@ -40,7 +39,6 @@ def render(
         path: a camera path that nerfstudio's viewer saved (.json). By default the film goes exactly through the poses;
             without poses around an object, or past what shows most of a room.
         split: layout of two scenes.
-        labels: labels of two scenes; by default their names and counts. "" writes none on one.
         width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
         height: its height, pixels; by default in the proportion of the path or the photos.
         fps: frames a second; by default 24, or as in the saved path.
@@ -59,8 +57,8 @@ def render(
     else:
         options.claim_file(output, force)
     count = ps.render_path(
-        scene, output, other, path=path, views=poses, split=split, labels=labels, up=up, data=data, width=width,
-        height=height, fps=fps, seconds=seconds, force=force, progress=True,
+        scene, output, other, path=path, views=poses, split=split, up=up, data=data, width=width, height=height,
+        fps=fps, seconds=seconds, force=force, progress=True,
     )  # fmt: skip
     files = output.iterdir() if output.is_dir() else [output]
     size, seconds_taken = sum(file.stat().st_size for file in files), time.perf_counter() - start

@@ -18,47 +18,34 @@ if TYPE_CHECKING:
 def tradeoff(
     scene: options.Scene,
     output: options.Output = None,
-    keep: tuple[str, ...] | None = None,
+    keep: tuple[str, ...] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
     by: tuple[str, ...] = ("merge",),
-    sh: tuple[Literal["all", "0", "1", "2", "3"], ...] = ("all",),
-    repairs: tuple[Literal["none", "refiner", "quick", "thorough", "photos"], ...] = ("none", "quick"),
+    repairs: tuple[Literal["none", "quick", "thorough", "photos"], ...] = ("none", "quick"),
     views: int = 12,
     poses: options.Poses = None,
     resolution: options.Resolution = None,
     up: options.Up = None,
     data: options.Data = None,
     photos: Path | None = None,
-    target_db: float | None = None,
-    target_ms: float | None = None,
-    target_mb: options.Megabytes | None = None,
     force: options.Force = False,
     threads: options.Threads = None,
     json_output: options.Json = False,
 ) -> None:
-    """Measure how a scene trades quality for frame time, size and count, on this machine.
-
-    It measures each method, SH degree and repair at each budget. Each point is saved as soon as it is measured: after
-    an interruption the same command resumes. With a target it searches for the cheapest scene that meets all targets
-    instead, and writes it.
+    """Measure how a scene trades quality for frame time, size and count, on this machine: each method and repair at
+    each budget. The figures are written as JSON, and as a page with pictures.
 
     Args:
-        output: the folder for points, pictures, the table and the page; by default beside the scene: room_tradeoff
-            for room.ply, tradeoff in the folder of a run.
-        keep: budgets: ratios (30%), counts (50000) or sizes (12MB); by default 70%, 50%, 30%, 20%, 10% and 5%.
+        output: the folder for the results; by default beside the scene: room_tradeoff for room.ply, tradeoff in the
+            folder of a run.
+        keep: budgets: ratios (30%), counts (50000) or sizes (12MB).
         within: largest loss of the recommended point against photos, dB. Without photos the loss is estimated from
             renders.
-        by: methods of prune; a search for targets uses the first one.
-        sh: SH degrees to measure: all bands, or those up to a degree.
-        repairs: repairs to try: none, the refiner alone, compact's efforts quick and thorough, or its --photos.
+        by: methods of prune.
+        repairs: repairs to try: none, compact's efforts quick and thorough, or its --photos.
         views: largest number of views; without photos at most 12.
         photos: folder of photos to judge by, where the scene is no run: every eighth, by name. --poses names the file
             with their poses, or one is looked for.
-        target_db: search for the smallest scene with at least this PSNR against the dense scene's renders. By default
-            there is no search.
-        target_ms: longest time of a frame, milliseconds; by default no limit. Without --target-db, search for the best
-            within the limits.
-        target_mb: largest file: 12, 12MB, 800kB; by default no limit.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -71,9 +58,8 @@ def tradeoff(
     folder = output or options.output_beside(scene, "tradeoff", "")
     with fixed_threads(threads):
         found = ps.measure_tradeoff(
-            scene, folder, keep=keep, within=within, by=by, sh=sh, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, up=up, data=data, photos=photos, target_db=target_db, target_ms=target_ms,
-            target_mb=target_mb, force=force, progress=True,
+            scene, folder, keep=keep, within=within, by=by, repairs=repairs, views=views, poses=poses,
+            resolution=resolution, up=up, data=data, photos=photos, force=force, progress=True,
         )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})
@@ -88,13 +74,12 @@ def tradeoff(
         print(f"{best.label}: {quality_line(best.against_dense.psnr, best.against_dense.ssim)}")
     if best.command:
         print(f"$ {best.command}")
-    print(f"{folder}: table and pictures; open {folder / RESULTS['page']}")
+    print(f"open {folder / RESULTS['page']}")
 
 
 def _print_table(found: Tradeoff) -> None:
     """The figures that matter most; the others are in the table on disk."""
     from pointsplat_ns.io.files import three_digits
-    from pointsplat_ns.tradeoff.points import speed_of
 
     photos = found.points[0].against_photos is not None
     count = counted(len(found.points), "point")
@@ -102,15 +87,14 @@ def _print_table(found: Tradeoff) -> None:
     print(found.machine)
     rows = []
     for point in found.points:
-        speed = speed_of(point, found.points[0])
         rows.append(
             (
                 point.label + (" *" if point.key == found.recommended else ""),
                 f"{point.gaussians:,}",
                 three_digits(point.bytes / 1e6),
-                f"{speed.median:.1f} ({speed.low:.1f}-{speed.high:.1f})",
+                "{:.1f} ({:.1f}-{:.1f})".format(*point.speed),
                 three_digits(point.frame_ms),
-                "-" if point.fill is None else f"{point.fill:.1f}",
+                f"{point.fill:.1f}",
                 *([psnr_text(point.against_photos.psnr if point.against_photos else None)] if photos else []),
                 psnr_text(point.against_dense.psnr),
                 f"{point.against_dense.ssim:.2f}",

@@ -19,8 +19,7 @@ def view(
     port: int = 7007,
 ) -> None:
     """Look at a scene in the browser, or at two from the same camera. A slider keeps less of the Gaussians, merged as
-    `prune` does. The browser draws; one without WebGL 2 shows pictures that this machine's processor draws. Ctrl-C ends
-    it.
+    `prune` does. The browser draws; it needs WebGL 2. Ctrl-C ends it.
 
     Args:
         scene: a file of any format, a checkpoint, or a run (its folder or config.yml); by default the page

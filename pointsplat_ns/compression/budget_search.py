@@ -29,53 +29,41 @@ SLOPE = 6.0
 """Usual gain of merged scenes for each e-fold of the count, dB."""
 
 
-@dataclass(frozen=True)
-class FoundCount:
-    """The result of a search."""
-
-    count: int | None
-    """The best count that meets the target; None if none does."""
-    slope: float | None
-    """Rise of the measure for each e-fold of the count near the target; None if it is not known."""
-
-
 def find_count(
     measure: Callable[[int], float],
     target: float,
     at_least: bool,
     first: int,
     most: int,
-    least: int = 1,
     slope: float | None = None,
-    precision: float = 1.05,
     tolerance: float = 0.0,
     tries: float = math.inf,
-) -> FoundCount:
-    """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it.
+) -> int | None:
+    """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it;
+    None if none does. The next count that was tried is at most 5 % away, or the measure within the tolerance.
 
     Args:
         measure: from a count to a number that rises with it. It is called once for each count tried.
         target: the number to reach, or not to exceed.
         at_least: whether the measure has to reach the target; if not, it must not exceed it.
         first: the first count tried.
-        most, least: bounds of the count.
+        most: bound of the count.
         slope: rise of the measure for each e-fold of the count; None if it is not known.
-        precision: the search ends at this ratio of a count that meets the target to one that misses it.
         tolerance: distance from the target at which a count that meets it is good enough.
         tries: largest number of counts tried, once one has met the target.
 
     Example:
-        >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000).count in range(420, 442)
+        >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000) in range(420, 442)
         True
     """
     aimed = target + (0.5 if at_least else -0.5) * tolerance
     # Without a tolerance, interpolated counts move by a share of the interval to the side that meets the target, so
     # that the last count tried is likely to meet it; and extrapolated steps go further, so that two counts enclose it.
     margin, overshoot = (0.0, 1.0) if tolerance else (0.03 if at_least else -0.03, 1.05)
-    low, high = least - 1, most + 1  # counts below the target, and at or above it; out of bounds until measured
+    low, high = 0, most + 1  # counts below the target, and at or above it; out of bounds until measured
     values: dict[int, float] = {}
     best: int | None = None
-    count = min(max(first, least), most)
+    count = min(max(first, 1), most)
     while True:
         value = values[count] = measure(count)
         below = value < target if at_least else value <= target
@@ -83,16 +71,16 @@ def find_count(
         if below != at_least:
             best = count
         slope = _slope(values, target, slope)
-        close = best is not None and high <= max(low, 1) * precision
+        close = best is not None and high <= max(low, 1) * 1.05
         good_enough = best == count and 0 < tolerance >= abs(value - target)
         if close or good_enough or high - low <= 1 or (best is not None and len(values) >= tries):
-            return FoundCount(best, slope)
+            return best
         if low in values and high in values:
             guess = _interpolated(low, high, values[low], values[high], aimed, margin)
         else:
             tried = low if low in values else high
             guess = _extrapolated(tried, aimed - values[tried], slope, tried == low, overshoot)
-        if guess * precision > most and most not in values:
+        if guess * 1.05 > most and most not in values:
             guess = most
         count = min(high - 1, max(low + 1, round(guess)))
 
@@ -106,7 +94,7 @@ def find_size(bytes_of: Callable[[int], float], limit: float, first: int, most: 
         return math.log(bytes_of(count))
 
     target, tolerance = math.log(max(limit, 1)), -math.log(0.95)
-    return find_count(measure, target, False, first, most, slope=1.0, tolerance=tolerance, tries=4).count
+    return find_count(measure, target, False, first, most, slope=1.0, tolerance=tolerance, tries=4)
 
 
 def _interpolated(low: int, high: int, below: float, above: float, aimed: float, margin: float) -> float:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import math
 import time
-from typing import Literal
 
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason
 from pointsplat_ns.compression.budget_search import FileLimit
@@ -71,15 +70,6 @@ def compact_scene(
     seen = (views.text,) if views.origin and views.text not in pruned.notes else ()
     seconds = time.perf_counter() - start
     return Compacted(tuple(stages), (*seen, *pruned.notes), reference, seconds, uncompared, interrupted=interrupted)
-
-
-def as_compacted(
-    dense: Gaussians, pruned: Gaussians, views: ViewSource, notes: tuple[str, ...], by: str = "merge"
-) -> Compacted:
-    """The result of :func:`compact_scene` for a scene that is only pruned by a method, with notes on the pruning."""
-    reference = DenseReference(dense, views.compared())
-    name: Literal["merge", "prune"] = "merge" if by == "merge" else "prune"
-    return Compacted((Stage(name, pruned, reference.closeness(pruned)),), notes, reference, 0.0)
 
 
 def _refined(last: Stage, refiner: TrainedRefiner, judge: Comparison | None, progress: Progress) -> Stage:

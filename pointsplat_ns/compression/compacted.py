@@ -64,10 +64,9 @@ class Compacted:
     uncompared: str = ""
     """Why there are no views to compare renders in; empty if there are."""
     target: str = ""
-    """Text on the search for targets: the cost, and the target that the next cheaper scene misses; empty if there was
-    no search."""
+    """Text on the search for a PSNR: what was reached, and its cost; empty if there was no search."""
     interrupted: bool = False
-    """Whether Ctrl-C ended the repair or the search for targets early."""
+    """Whether Ctrl-C ended the repair or the search for a PSNR early."""
 
     def _stage(self, name: str) -> Stage | None:
         return next((stage for stage in self.stages if stage.name == name), None)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.errors import BudgetError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.pruning import (
     Keep,
@@ -161,6 +161,8 @@ class CompactRequest:
     """Length of the repair."""
     photos: PhotoBudget | None = None
     """Length of the optimisation against photos; None for none."""
+    target_db: float | None = None
+    """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None for none."""
 
     @classmethod
     def of(
@@ -173,10 +175,17 @@ class CompactRequest:
         repair: RepairBudget = RepairBudget("instant"),
         photos: bool = False,
         suffix: str = ".ply",
+        target_db: float | None = None,
     ) -> CompactRequest:
         """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
         without a refiner, a tenth and merging. With ``photos``, a number of seconds is for the steps on
-        photos, and the repair is quick. Errors are those of :class:`PruneRequest`."""
+        photos, and the repair is quick. Errors are those of :class:`PruneRequest`, or a BudgetError if the target is
+        not a positive number, or given with a budget or photos."""
+        if target_db is not None and not 0 < target_db < math.inf:
+            raise BudgetError(f"--target-db is {target_db:g}; expected a positive number, such as 32")
+        if target_db is not None and (photos or keep is not None):
+            other = "photos, which may differ from renders" if photos else "a budget"
+            raise BudgetError(f"--target-db finds a size by renders of the dense scene; expected it without {other}")
         usual_keep, usual_by, weight = 0.1, "merge", None
         if refiner is not None:
             usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
@@ -184,7 +193,7 @@ class CompactRequest:
         weight = weight if method_named(by).weighs_opacity else None
         prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean, suffix)
         if not photos:
-            return cls(prune, refiner, repair)
+            return cls(prune, refiner, repair, target_db=target_db)
         trained = PhotoBudget(repair.effort, repair.seconds)
         return cls(prune, refiner, repair if repair.seconds is None else RepairBudget(), trained)
 

@@ -33,9 +33,6 @@ class FolderFiles:
     scenes_lock: str = ".scenes.lock"
     levels: str = "lod.json"
     """Manifest of levels of detail."""
-    levels_picture: str = "lod.png"
-    sweep: str = "tradeoff.json"
-    """Results of a sweep."""
 
 
 FOLDER_FILES = FolderFiles()
@@ -185,7 +182,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
     """
     paths = [root] if root.is_file() and wanted(root.name) else []
     for place, inner, files in os.walk(root):
-        results = {FOLDER_FILES.scenes, FOLDER_FILES.levels, FOLDER_FILES.sweep}.intersection(files)
+        results = {FOLDER_FILES.scenes, FOLDER_FILES.levels}.intersection(files)
         if RUN_FILES.config in files or (results and Path(place) != root):
             inner.clear()
             continue

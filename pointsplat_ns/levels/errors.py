@@ -1,34 +1,43 @@
-"""Errors of a level of detail: of its renders in near and farther views."""
+"""The distance from which on a level of detail shows enough, by its renders in near and farther views."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.closeness import Reference
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.tensors import DOUBLES
 
-
-@dataclass(frozen=True)
-class RenderErrors:
-    """Errors of a level's renders against the dense scene's own."""
-
-    near: Quality
-    """In the views that every command judges in."""
-    farther: dict[int, float]
-    """PSNR in dB by multiple of the distance, see :func:`far_references`."""
-
-
 ENOUGH = 30.0
 """PSNR in dB against the dense scene from which on a level is taken to show as much, see :func:`pixel_size_for`."""
 
 
-def pixel_size_for(errors: RenderErrors, farther: dict[int, float], pixel_size: float) -> float:
+def pixel_sizes(
+    dense: Gaussians, reference: Reference, levels: Sequence[Gaussians], near: Sequence[float]
+) -> list[float] | None:
+    """Scene units a pixel from which on each level shows enough; None if the dense scene covers no pixel.
+
+    Args:
+        dense: the scene that the levels were made of.
+        reference: its renders.
+        levels: their scenes.
+        near: PSNR in dB of each in the views that every command judges in.
+    """
+    distance = median_depth(dense, reference)
+    if distance is None:
+        return None
+    pixel = distance / float(reference.views.Ks[:, 1, 1].median())
+    afar = far_references(reference)
+    whole, *others = ({times: far.psnr(scene)[0] for times, far in afar.items()} for scene in (dense, *levels))
+    return [pixel_size_for({1: psnr, **psnrs}, whole, pixel) for psnr, psnrs in zip(near, others, strict=True)]
+
+
+def pixel_size_for(psnrs: dict[int, float], whole: dict[int, float], pixel_size: float) -> float:
     """Scene units a pixel from which on a level shows enough: its PSNR is :data:`ENOUGH`, or that of the dense scene
     where this is lower.
 
@@ -36,13 +45,12 @@ def pixel_size_for(errors: RenderErrors, farther: dict[int, float], pixel_size: 
     compared distance to 64 times it.
 
     Args:
-        errors: of the level.
-        farther: PSNR in dB of the dense scene itself, by multiple of the distance.
+        psnrs: PSNR in dB of the level, by multiple of the distance.
+        whole: the same of the dense scene itself.
         pixel_size: of the compared views at the median depth, scene units.
     """
-    measured = {1: errors.near.psnr, **errors.farther}
-    short = [min(psnr, 99.0) - min(ENOUGH, farther.get(times, ENOUGH)) for times, psnr in measured.items()]
-    doublings, gap = torch.tensor([*measured], **DOUBLES).log2(), torch.tensor(short, **DOUBLES)
+    short = [min(psnr, 99.0) - min(ENOUGH, whole.get(times, ENOUGH)) for times, psnr in psnrs.items()]
+    doublings, gap = torch.tensor([*psnrs], **DOUBLES).log2(), torch.tensor(short, **DOUBLES)
     about = doublings - doublings.mean()
     slope = max(float((about @ gap) / about.square().sum().clamp_min(1e-9)), 1.0)  # dB each time twice as far
     return pixel_size * 2.0 ** min(max(float(doublings.mean() - gap.mean() / slope), -3.0), 6.0)

@@ -13,30 +13,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.quality import Judge
+from pointsplat_ns.compression.quality import Judge, Quality
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.levels.errors import RenderErrors, far_references, median_depth, pixel_size_for
+from pointsplat_ns.levels.errors import pixel_sizes
 from pointsplat_ns.levels.folder import write_levels
 from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.levels.tiles import placed, write_tiles
-from pointsplat_ns.looking.closeness import DenseReference, Reference
+from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
-from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, silent
 
 DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
@@ -51,14 +48,14 @@ class Level:
     assignment: Tensor  # [N] int64, index in ``scene`` for each Gaussian of the dense scene; -1 if dropped
     dropped: int
     """Number of Gaussians of the dense scene without a place in this level, because they are too faint to be drawn."""
-    errors: RenderErrors | None
-    """Errors of its renders against the dense scene's; None if there is no view."""
+    quality: Quality | None
+    """How close its renders are to the dense scene's; None if there is no view."""
     seconds: float
     """Duration of merging from the level before."""
 
     def facts(self, whole: int) -> dict[str, Any]:
         """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense scene."""
-        errors, near = self.errors, self.errors and self.errors.near
+        near = self.quality
         return {
             "count": len(self.scene),
             "share": len(self.scene) / whole,
@@ -68,7 +65,6 @@ class Level:
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
             "quality": near and str(near),
-            "psnr_farther": errors and _farther(errors.farther),
         }
 
 
@@ -92,10 +88,6 @@ class Levels:
     """The finest first."""
     reference: DenseReference | None
     """Renders of the dense scene, for comparison with the levels; None if there are no views."""
-    farther: dict[int, float]
-    """PSNR in dB of the dense scene itself by multiple of the distance: the reference for levels in distant views."""
-    distance: float | None
-    """Median depth over the covered pixels of ``reference``, scene units."""
     origin: str
     """Origin of those views."""
     source: SourceFile | None
@@ -132,7 +124,7 @@ class Levels:
         return iter(self.levels)
 
     def save(self, folder: str | Path, force: bool = False) -> None:
-        """Write every level, the manifest and the picture to a folder, as ``pointsplat lod`` does.
+        """Write every level and the manifest to a folder, as ``pointsplat lod`` does.
 
         Args:
             folder: created if it is missing.
@@ -141,18 +133,12 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        write_levels(folder, self.scenes, *self._manifest(), *self._picture(), force)
+        write_levels(folder, self.scenes, *self._manifest(), force)
 
-    def save_stream(
-        self,
-        folder: str | Path,
-        force: bool = False,
-        progress: Progress = silent,
-        page: StreamPage | None = None,
-    ) -> list[int]:
+    def save_stream(self, folder: str | Path, force: bool = False, progress: Progress = silent) -> list[int]:
         """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
         :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
-        return write_stream(folder, self.scenes, self.parents, force, progress, page)
+        return write_stream(folder, self.scenes, self.parents, force, progress)
 
     def save_paged(self, path: str | Path, progress: Progress = silent) -> int:
         """Write the levels as a RAD file, as ``pointsplat lod -o room.rad`` does; see
@@ -185,10 +171,9 @@ class Levels:
     def _pixel_sizes(self) -> list[float]:
         """Scene units a pixel from which on each level shows enough; without views, the typical size of its
         Gaussians."""
-        if self.reference is None or self.distance is None:
-            return [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
-        pixel = self.distance / float(self.reference.views.Ks[:, 1, 1].median())
-        return [pixel_size_for(level.errors, self.farther, pixel) for level in self if level.errors is not None]
+        near = [level.quality.psnr for level in self if level.quality is not None]
+        found = None if self.reference is None else pixel_sizes(self.dense, self.reference, self.scenes, near)
+        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
 
     def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The manifest's facts on all levels together, and on each."""
@@ -198,46 +183,16 @@ class Levels:
             boxes["content"] = content_box(dense)
         if self.reference is not None:
             of = self.reference.views
-            focal = float(of.Ks[:, 1, 1].median())
-            views = {
-                "count": len(of),
-                "origin": self.origin,
-                "width": of.width,
-                "height": of.height,
-                "focal": focal,
-                "distance": self.distance,
-                "pixel_size": self.distance and self.distance / focal,
-            }
+            views = {"count": len(of), "origin": self.origin, "width": of.width, "height": of.height}
         source = {
             "file": file and file.name,
             "bytes": file and file.bytes,
             "sha256": file and file.sha256,
             "count": len(dense),
             "sh_degree": dense.sh_degree,
-            "psnr_farther": _farther(self.farther) if self.reference is not None else None,
         }
         bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
         return {"source": source, "bounds": bounds, "views": views}, [level.facts(len(dense)) for level in self]
-
-    @torch.no_grad()
-    def _picture(self) -> tuple[list[Tensor], list[str]]:
-        """Images and captions of the dense scene and of every level, in the view with the median error at the coarsest
-        level; none if there is no view."""
-        if self.reference is None:
-            return [], []
-        views = self.reference.views
-        index_of_view = int(np.argsort(self.reference.errors(self[-1].scene), kind="stable")[(len(views) - 1) // 2])
-        images, captions = [self.reference.renders[index_of_view]], [f"dense: {len(self.dense):,} Gaussians"]
-        for index, level in enumerate(self):
-            assert level.errors is not None
-            images.append(render(level.scene, views[index_of_view]))
-            share = f"{100 * len(level.scene) / len(self.dense):.3g} %"
-            captions.append(f"level {index}: {len(level.scene):,} ({share})\n{level.errors.near}")
-        return images, captions
-
-
-def _farther(psnrs: dict[int, float]) -> list[dict[str, Any]]:
-    return [{"times": times, "psnr": psnr} for times, psnr in psnrs.items()]
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
@@ -313,34 +268,26 @@ def make_levels(
     progress("rendering the dense scene", 0.0)
     cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
     counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.traits)
-    notes, reference, distance, judge = cut.notes, None, None, None
-    afar: dict[int, Reference] = {}
+    notes, reference, judge = cut.notes, None, None
     try:
         judge, reference = Judge(dense, views), DenseReference(dense, views.compared())
-        afar = far_references(reference)
-        distance = median_depth(dense, reference)
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
-    farther = {times: far.psnr(dense)[0] for times, far in afar.items()}
     made: list[Level] = []
     start = time.perf_counter()
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
-        errors = None
-        if judge is not None:
-            progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
-            afar_psnrs = {times: far.psnr(merged.scene)[0] for times, far in afar.items()}
-            errors = RenderErrors(judge.quality(merged.scene), afar_psnrs)
+        progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
         made.append(
             Level(
                 scene=merged.scene,
                 assignment=merged.assignment,
                 dropped=int((merged.assignment < 0).sum()),
-                errors=errors,
+                quality=None if judge is None else judge.quality(merged.scene),
                 seconds=seconds,
             )
         )
         start = time.perf_counter()
-    return Levels(dense, tuple(made), reference, farther, distance, views.origin, source, notes, judge)
+    return Levels(dense, tuple(made), reference, views.origin, source, notes, judge)

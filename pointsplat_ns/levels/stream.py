@@ -7,21 +7,18 @@ coarsest one. Where two leaves of different levels meet, nothing is drawn twice 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.levels.tree import Parts, grouped, halved, leaves
 from pointsplat_ns.looking.content import content_size
-from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import INDICES
 
@@ -32,7 +29,6 @@ def write_stream(
     parents: Sequence[Tensor],
     force: bool = False,
     progress: Progress = silent,
-    page: StreamPage | None = None,
 ) -> list[int]:
     """Write levels of detail as a streamed SOG.
 
@@ -43,7 +39,6 @@ def write_stream(
             that are too faint to be drawn, which are left out.
         force: whether an existing stream may be overwritten.
         progress: called while encoding.
-        page: written beside it; the levels are turned as it says.
 
     Returns:
         The number of Gaussians written of each level.
@@ -52,20 +47,13 @@ def write_stream(
         SceneError: if the folder cannot be used, or a file cannot be written.
     """
     folder = Path(folder)
-    files = {} if page is None else page.files
-    check_folder(folder, (STREAM_META, *files), force)
+    check_folder(folder, (STREAM_META,), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
-    if page is not None and page.turn is not None:
-        scenes = [page.turn.apply(scene) for scene in scenes]
     if scenes:
         warn_of_losses(format_to_write(SOG_META), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
-    with ExitStack() as stack:
-        for name, data in files.items():
-            stack.enter_context(replacing(folder / name, len(data))).write_bytes(data)
-        counts = write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]
-    return counts
+    return write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]
 
 
 def partition(

@@ -11,10 +11,9 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.outputs import claimed, claimed_folder
-from pointsplat_ns.levels.folder import check_folder, check_level_folder
+from pointsplat_ns.levels.folder import check_folder, level_names
 from pointsplat_ns.levels.levels import Levels
 from pointsplat_ns.levels.tiles import TILESET
-from pointsplat_ns.pages.stream_page import StreamPage
 from pointsplat_ns.system.progress import Progress
 
 Form = Literal["folder", "stream", "tiles", "paged"]
@@ -35,11 +34,9 @@ class LevelOutput:
 
     @staticmethod
     def of(
-        path: str | Path | None, stream: bool, tiles: bool, html: bool, at: str | None, up: str | None, force: bool
+        path: str | Path | None, stream: bool, tiles: bool, at: str | None, up: str | None, force: bool
     ) -> LevelOutput | None:
         """The output of options of :func:`pointsplat_ns.lod`; None if nothing is written."""
-        if html and (not stream or path is None):
-            raise PointSplatError("a page is written beside a stream; expected --stream with --html")
         if stream and tiles or at is not None and not tiles:
             raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
         if at is not None:
@@ -50,22 +47,19 @@ class LevelOutput:
         form: Form = "stream" if stream else "tiles" if tiles else "paged" if paged else "folder"
         return LevelOutput(Path(path), form, at, up, force)
 
-    def claim(self, count: int, page: tuple[str, ...]) -> AbstractContextManager[object]:
-        """Check that ``count`` levels, and a page of some files, can be written; no other program writes there while
-        the context is open."""
+    def claim(self, count: int) -> AbstractContextManager[object]:
+        """Check that ``count`` levels can be written; no other program writes there while the context is open."""
         if self.form == "paged":
             return claimed(self.path, self.force)
-        if self.form == "folder":
-            check_level_folder(self.path, count, self.force)
-        else:
-            check_folder(self.path, (TILESET if self.form == "tiles" else STREAM_META, *page), self.force)
+        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[self.form]
+        check_folder(self.path, names, self.force)
         return claimed_folder(self.path)
 
-    def write(self, levels: Levels, page: StreamPage | None, progress: Progress) -> Levels:
+    def write(self, levels: Levels, progress: Progress) -> Levels:
         """Write levels; those of a stream are then judged as they are in its files."""
         if self.form == "stream":
-            levels.save_stream(self.path, self.force, progress, page)
-            return _read_back(levels, self.path, page)
+            levels.save_stream(self.path, self.force, progress)
+            return _read_back(levels, self.path)
         if self.form == "paged":
             levels.save_paged(self.path, progress)
         elif self.form == "tiles":
@@ -75,14 +69,10 @@ class LevelOutput:
         return levels
 
 
-def _read_back(levels: Levels, folder: Path, page: StreamPage | None) -> Levels:
+def _read_back(levels: Levels, folder: Path) -> Levels:
     """Levels, judged as they are in a stream."""
     judged = []
     for index, level in enumerate(levels):
-        errors = level.errors
-        if levels.judge is not None and errors is not None:
-            read = read_sog_stream(folder, index)
-            read = read if page is None or page.turn is None else page.turn.inverse().apply(read)
-            errors = replace(errors, near=levels.judge.quality(read))
-        judged.append(replace(level, errors=errors))
+        quality = None if levels.judge is None else levels.judge.quality(read_sog_stream(folder, index))
+        judged.append(replace(level, quality=quality))
     return replace(levels, levels=tuple(judged))

@@ -27,22 +27,17 @@ from pointsplat_ns.pages.trajectories import along, fitted, toured
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
+FPS = 24.0
+"""Frames a second, unless something else is asked for."""
 
-@dataclass(frozen=True)
-class PathSettings:
-    """Defaults and limits of camera paths and films."""
+MOST_FRAMES = 100_000
+"""Maximum number of cameras."""
 
-    fps: float = 24.0
-    """Frames a second."""
-    photo_side: int = 960
-    """Largest longer side of pictures from the poses of photos, without a given size, pixels."""
-    frames: int = 100_000
-    """Maximum number of cameras."""
-    pixels: int = 16_384
-    """Maximum width and height of a picture."""
+MOST_PIXELS = 16_384
+"""Maximum width and height of a picture."""
 
-
-CAMERA_PATH = PathSettings()
+PHOTO_SIDE = 960
+"""Largest longer side of pictures from the poses of photos, without a given size, pixels."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +56,12 @@ class FilmSettings:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if value is not None and not 2 <= value <= CAMERA_PATH.pixels:
-                raise PointSplatError(f"{name} is {value}; expected 2 to {CAMERA_PATH.pixels} pixels")
+            if value is not None and not 2 <= value <= MOST_PIXELS:
+                raise PointSplatError(f"{name} is {value}; expected 2 to {MOST_PIXELS} pixels")
         if self.fps is not None and not 0.1 <= self.fps <= 1000:  # NaN fails too
             raise PointSplatError(f"fps is {self.fps:g}; expected 0.1 to 1000 frames a second")
-        if self.seconds is not None and not 0 < self.seconds * (self.fps or CAMERA_PATH.fps) <= CAMERA_PATH.frames:
-            raise PointSplatError(f"seconds are {self.seconds:g}; expected 1 to {CAMERA_PATH.frames} frames in all")
+        if self.seconds is not None and not 0 < self.seconds * (self.fps or FPS) <= MOST_FRAMES:
+            raise PointSplatError(f"seconds are {self.seconds:g}; expected 1 to {MOST_FRAMES} frames in all")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +100,7 @@ def camera_path(
         SceneError: if there is no such file.
     """
     up = known_up(up, scene)
-    known = source.known(CAMERA_PATH.frames)
+    known = source.known(MOST_FRAMES)
     if saved is not None:
         path = read_path(saved)
         fps = settings.fps or path.fps
@@ -114,7 +109,7 @@ def camera_path(
         if known is not None:
             views = dataclasses.replace(views, background=known.background, rasterize_mode=known.rasterize_mode)
         return CameraPath(views if frames == len(views) else along(views, frames), fps, path.origin)
-    fps = settings.fps or CAMERA_PATH.fps
+    fps = settings.fps or FPS
     frames = 1 if one else _frames(10.0 if settings.seconds is None else settings.seconds, fps)
     if known is None:
         opening = opening_views(scene, 1 if one else VIEW_COUNTS.walked, *_shape(settings, (960, 540)), up)
@@ -123,7 +118,7 @@ def camera_path(
         return CameraPath(along(stops, frames, opening.up.direction), fps, origin)
     if settings.seconds is None and not one:
         frames = max(frames, len(known))
-    usual = known if source.given is not None else known.resized(CAMERA_PATH.photo_side)
+    usual = known if source.given is not None else known.resized(PHOTO_SIDE)
     if one:
         known = opening_views(scene, up=up, known=known.spread(4 * VIEW_COUNTS.walked)).views
     views = along(_sized(known, settings, (usual.width, usual.height)), frames)
@@ -132,7 +127,7 @@ def camera_path(
 
 
 def _frames(seconds: float, fps: float) -> int:
-    return min(max(round(seconds * fps), 1), CAMERA_PATH.frames)
+    return min(max(round(seconds * fps), 1), MOST_FRAMES)
 
 
 def _sized(views: Views, settings: FilmSettings, usual: tuple[int, int]) -> Views:
@@ -164,46 +159,44 @@ def read_path(path: Path | str) -> CameraPath:
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)})") from error
     cameras = content.get("camera_path") if isinstance(content, dict) else None
-    if not isinstance(cameras, list) or not 0 < len(cameras) <= CAMERA_PATH.frames:
-        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {CAMERA_PATH.frames} cameras")
+    if not isinstance(cameras, list) or not 0 < len(cameras) <= MOST_FRAMES:
+        raise DataError(f"{path}: no camera path; expected 'camera_path', a list of 1 to {MOST_FRAMES} cameras")
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
         raise DataError(f"{path}: cameras are {str(kind)[:40]!r}; expected perspective ones")
-    width, height = (_size(content.get(name), name, path) for name in ("render_width", "render_height"))
+    sides = [finite(content.get(name)) or 0.0 for name in ("render_width", "render_height")]
+    if not all(side == int(side) and 1 <= side <= MOST_PIXELS for side in sides):
+        found = f"{content.get('render_width')!r:.40} x {content.get('render_height')!r:.40}"
+        raise DataError(f"{path}: a picture of {found} pixels; expected 1 to {MOST_PIXELS} a side")
     if content.get("crop"):
         logger.warning("%s: its crop is not applied", path)
-    poses, focals = zip(*(_camera(camera, index, height, path) for index, camera in enumerate(cameras)), strict=True)
+    width, height = map(int, sides)
+    read = [_camera(camera, f"{path}: camera {index}") for index, camera in enumerate(cameras)]
+    poses, fovs = zip(*read, strict=True)
     Ks = torch.zeros(len(cameras), 3, 3, **DOUBLES)
+    focals = [0.5 * height / math.tan(math.radians(fov) / 2) for fov in fovs]
     Ks[:, 0, 0] = Ks[:, 1, 1] = torch.tensor(focals, **DOUBLES)
     Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
     fps = finite(content.get("fps"))
     views = Views(viewmats_from_opengl(torch.stack(poses)), Ks, width, height, torch.zeros(3, **FLOATS))
-    return CameraPath(views, fps if fps is not None and 0 < fps <= 1000 else CAMERA_PATH.fps, f"the path of {path}")
+    return CameraPath(views, fps if fps is not None and 0 < fps <= 1000 else FPS, f"the path of {path}")
 
 
-def _size(value: Any, name: str, path: Path) -> int:
-    number = finite(value)
-    if number is None or number != int(number) or not 1 <= number <= CAMERA_PATH.pixels:
-        raise DataError(f"{path}: {name} is {str(value)[:40]}; expected 1 to {CAMERA_PATH.pixels} pixels")
-    return int(number)
-
-
-def _camera(camera: Any, index: int, height: int, path: Path) -> tuple[Tensor, float]:
-    """Pose (3, 4) from camera to world, OpenGL axes, and focal length in pixels."""
+def _camera(camera: Any, name: str) -> tuple[Tensor, float]:
+    """Pose (3, 4) from camera to world, OpenGL axes, and field of view in degrees."""
     values = camera.get("camera_to_world") if isinstance(camera, dict) else None
     numbers = [finite(value) for value in values] if isinstance(values, list) and len(values) == 16 else [None]
-    if any(number is None for number in numbers):
-        raise DataError(f"{path}: camera {index} has no pose; expected 'camera_to_world', 16 finite numbers")
+    if None in numbers:
+        raise DataError(f"{name} has no pose; expected 'camera_to_world', 16 finite numbers")
     pose = torch.tensor(numbers, **DOUBLES).view(4, 4)
     turn = pose[:3, :3]
-    off = (turn @ turn.T - torch.eye(3, **FLOATS)).abs().max()
-    last = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()
-    rigid = (off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)  # nerfstudio writes 16 digits
-    if not bool(rigid):  # NaN fails too
-        raise DataError(f"{path}: the pose of camera {index} is no rigid motion; expected a rotation and a position")
+    off = (turn @ turn.T - torch.eye(3, **DOUBLES)).abs().max()
+    last = (pose[3] - torch.eye(4, **DOUBLES)[3]).abs().max()
+    if not bool((off <= 1e-3) & (last <= 1e-3) & (torch.linalg.det(turn) > 0)):  # nerfstudio writes 16 digits
+        raise DataError(f"{name}: its pose is no rigid motion; expected a rotation and a position")
     if float(pose[:3, 3].abs().max()) > 1e9:  # its square is finite in float32
-        raise DataError(f"{path}: camera {index} is farther than 1e+09 units from the origin; expected it nearer")
+        raise DataError(f"{name} is farther than 1e+09 units from the origin; expected it nearer")
     fov = finite(camera.get("fov"))
     if fov is None or not 0.1 <= fov <= 179:
-        raise DataError(f"{path}: fov of camera {index} is {str(camera.get('fov'))[:40]}; expected 0.1 to 179 degrees")
-    return pose[:3], 0.5 * height / math.tan(math.radians(fov) / 2)
+        raise DataError(f"{name} has a fov of {str(camera.get('fov'))[:40]}; expected 0.1 to 179 degrees")
+    return pose[:3], fov

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -21,7 +20,7 @@ from pointsplat_ns.looking.content import in_units
 from pointsplat_ns.pages.film import with_labels
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import fit, read_png
+from pointsplat_ns.pages.pictures import picture_uri, read_png
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
@@ -56,15 +55,12 @@ def draw_pair(before: Gaussians, after: Gaussians, known: Views | None, path: Pa
 
 def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> None:
     """Write a page of all scenes before and after, with links to their files. Scenes that failed or are not finished
-    are listed. Raises SceneError if it cannot be written, and DataError if all pictures do not fit into 30 MB."""
-    drawn = {result.name: result for result in results if _pair(result) is not None}
-    pictures = [partial(_picture, result, side) for result in drawn.values() for side in (0, 1)]
-    uris = iter(fit(pictures, limit=30_000_000)[0])
-    scenes = [_facts(result, path, [next(uris) for _ in range(2 * (result.name in drawn))]) for result in results]
+    are listed. Raises SceneError if it cannot be written."""
+    scenes = [_facts(result, path) for result in results]
     done = [result for result in results if result.megabytes is not None]
     sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
     text = page(
-        "gallery.html", title=title, scenes=scenes, done=len(done), width=WIDTH, height=HEIGHT,
+        "gallery.html", title=title, scenes=scenes, done=len(done), width=2 * WIDTH, height=HEIGHT,
         sizes=[bytes_text(1e6 * size) for size in sizes],
     )  # fmt: skip
     with replacing(path) as part:
@@ -80,10 +76,13 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
     height, width = HEIGHT // step, 2 * WIDTH // step
     sheet = np.full((max(1, math.ceil(len(drawn) / columns)) * height, columns * width, 3), 255, np.uint8)
     for index, result in enumerate(drawn):
-        pair = np.concatenate([_picture(result, side)[: height * step : step, ::step] for side in (0, 1)], axis=1)
+        pair = _pair(result)
+        if pair is None:  # it has gone meanwhile
+            continue
         before, after = _sizes(result)
         row, column = divmod(index, columns)
-        labelled = with_labels(pair[:, :width], (f"{result.name}: {before}", after), width // 2)
+        small = pair[: height * step : step, ::step][:, :width]
+        labelled = with_labels(small, (f"{result.name}: {before}", after), width // 2)
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = labelled
     write_picture(torch.from_numpy(sheet) / 255, path)
 
@@ -94,12 +93,6 @@ def _pair(result: SceneResult) -> np.ndarray | None:
         return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
     except DataError:
         return None
-
-
-def _picture(result: SceneResult, side: int) -> np.ndarray:
-    """The picture of a scene before (0) or after (1); black if it has gone meanwhile."""
-    pair = _pair(result)
-    return np.zeros((HEIGHT, WIDTH, 3), np.uint8) if pair is None else pair[:, side * WIDTH : (side + 1) * WIDTH]
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:
@@ -113,12 +106,12 @@ def _sizes(result: SceneResult) -> tuple[str, str]:
     return before, after
 
 
-def _facts(result: SceneResult, path: Path, pictures: list[str]) -> dict[str, Any]:
+def _facts(result: SceneResult, path: Path) -> dict[str, Any]:
     """What the page at a path says of a scene."""
-    finished = result.megabytes is not None
+    finished, pair = result.megabytes is not None, _pair(result)
     said = str(result) if finished else result.error or "not finished"
     link = quote(Path(os.path.relpath(result.output, path.parent)).as_posix()) if finished else ""
     return {
-        "name": result.name, "file": Path(result.output).name, "link": link, "pictures": pictures,
-        "sizes": _sizes(result), "failed": bool(result.error), "said": said,
+        "name": result.name, "file": Path(result.output).name, "link": link, "sizes": _sizes(result),
+        "picture": None if pair is None else picture_uri(pair), "failed": bool(result.error), "said": said,
     }  # fmt: skip

@@ -6,7 +6,6 @@ Nothing of a request is a path. Pages of other sites, and names that resolve to 
 from __future__ import annotations
 
 import http
-import io
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -31,6 +30,7 @@ class Request:
     length: int
     """Size of its body, bytes."""
     body: BinaryIO
+    """What the client sends; empty reads if it sends less than it said."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,6 @@ class Server(ThreadingHTTPServer):
         self.routes = routes
         self.hosts = (*LOCAL, host) if host in LOCAL else None
         """Accepted names of the server; None for any."""
-        self._free = threading.Semaphore(64)
-        """Connections that may still be opened. Browsers open six for each page; each has a thread."""
         last = min(port + 20, 65536) if port else 1  # number of ports to try
         failed = ""
         for candidate in range(port, last):
@@ -97,20 +95,6 @@ class Server(ThreadingHTTPServer):
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection on a thread of its own, or close it where too many are open."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection until it is closed."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
-
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a client that has gone."""
 
@@ -128,8 +112,9 @@ def refusal(method: str, headers: Mapping[str, str], hosts: tuple[str, ...] | No
 
 
 class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-    timeout = 30  # s without a byte from a client, after which its connection is closed
+    """Answers one request, and closes its connection."""
+
+    timeout = 30  # s without a byte from a client
     server_version, sys_version = "pointsplat", ""
 
     def do_GET(self) -> None:
@@ -142,9 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are not logged."""
 
     def _serve(self) -> None:
-        last, self.close_connection = self.close_connection, True  # unless the whole body is read
         answer = self._answer()
-        self.close_connection |= last  # as the client asked
         self.send_response(answer.status)
         headers = {
             "Content-Type": answer.kind,
@@ -155,7 +138,6 @@ class _Handler(BaseHTTPRequestHandler):
             "Cross-Origin-Resource-Policy": "same-origin",
             "Referrer-Policy": "no-referrer",
             **answer.headers,
-            **({"Connection": "close"} if self.close_connection else {}),
         }
         for name, value in headers.items():
             self.send_header(name, value)
@@ -184,26 +166,13 @@ class _Handler(BaseHTTPRequestHandler):
         if int(length) > route.largest:
             text = f"{int(length):,} bytes; expected at most {route.largest:,}"
             return Answer(text.encode(), status=http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        body = _Body(self.rfile, int(length))
         try:
-            answer = route.answer(Request(options, int(length), cast(BinaryIO, body)))
-        except (ValueError, TypeError, KeyError, OverflowError):  # a body that no page of this server sends
-            answer = Answer(status=http.HTTPStatus.BAD_REQUEST)
-        self.close_connection = body.left > 0
-        return answer
-
-
-class _Body(io.RawIOBase):
-    """A body of known size, read from a connection."""
-
-    def __init__(self, stream: io.BufferedIOBase, length: int):
-        self._stream, self.left = stream, length
-
-    def read(self, size: int = -1) -> bytes:
-        """At most ``size`` bytes; empty at the end. Raises ValueError if the client sends less than it said."""
-        wanted = self.left if size < 0 else min(size, self.left)
-        data = self._stream.read(wanted)
-        if len(data) < wanted:
-            raise ValueError("the body is cut off")
-        self.left -= len(data)
-        return data
+            return route.answer(Request(options, int(length), cast(BinaryIO, self.rfile)))
+        except (
+            ValueError,
+            TypeError,
+            KeyError,
+            OverflowError,
+            RecursionError,
+        ):  # a body that no page of this server sends
+            return Answer(status=http.HTTPStatus.BAD_REQUEST)

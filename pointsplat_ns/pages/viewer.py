@@ -1,38 +1,29 @@
-"""The viewer: a page that draws a scene in the browser. It asks this server for the scene at other shares of its
-Gaussians, and for pictures if the browser cannot draw."""
+"""The viewer: a page that draws a scene in the browser, and asks this server for it at other shares of its
+Gaussians."""
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import shlex
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger, one_line
+from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.formats import FORMATS
-from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.pages.film import wiped
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.kept import Level, Levels
+from pointsplat_ns.pages.kept import Level, ViewedScene
 from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
-from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.views import View
 
 READABLE_NAMES = (
     *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt", ".pth", ".zip",
@@ -41,20 +32,6 @@ READABLE_NAMES = (
 
 LARGEST_FILE = 4_000_000_000
 """Largest file that may be dropped, bytes."""
-
-
-@dataclass(frozen=True, eq=False)
-class ViewedScene:
-    """A scene for the viewer."""
-
-    name: str
-    path: Path | None
-    """Path of the scene; None if it has none."""
-    scene: Gaussians
-    source: ViewSource
-    """Source of views."""
-    levels: Sequence[Gaussians] = ()
-    """Smaller scenes that are there already, as of :class:`~pointsplat_ns.pages.kept.Levels`."""
 
 
 class _Stage:
@@ -67,7 +44,6 @@ class _Stage:
         self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin
-        self.levels = [Levels(viewed.scene, viewed.source, viewed.levels) for viewed in scenes]
         shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]
         if len(scenes) == 1:
             shown.append({"name": "all of it", "amount": ""})
@@ -76,48 +52,18 @@ class _Stage:
 
     def state(self, index: int, percent: int, level: Level, whole: bool) -> dict[str, Any]:
         """What a page says of a level, with the command that makes it; ``whole`` if no better one comes."""
-        viewed, levels, command = self.scenes[index], self.levels[index], ""
-        amount = f"{len(levels.scene):,} Gaussians"
+        viewed, command = self.scenes[index], ""
+        amount = f"{len(viewed.scene):,} Gaussians"
         if percent < 100:
-            how = level.how if whole else levels.status or level.how
-            amount = f"{len(level.scene):,} of {amount}, {how}"
+            amount = f"{len(level.scene):,} of {amount}, {level.how}" + ("" if whole else ", merging ...")
             if viewed.path is not None:
                 command = shlex.join(["pointsplat", "prune", str(viewed.path), "--keep", f"{percent}%"])
         return {"amount": amount, "command": command, "how": level.how, "whole": whole}
 
-    def view(self, wanted: dict[str, Any]) -> View:
-        """The view that a page asks for. Errors are those of Python if it is not what the page of this server sends."""
-        camera, views = wanted["camera"], self.frame.views
-        width, height = (min(max(int(wanted[name]), 1), 4096) for name in ("width", "height"))
-        eye, right, down, ahead = (_vector(camera[name]) for name in ("eye", "right", "down", "ahead"))
-        turn, unit = torch.stack([right, down, ahead]), self.frame.size / UNITS
-        if not bool(((turn @ turn.T - torch.eye(3, **DOUBLES)).abs() < 1e-3).all()):
-            raise ValueError("no rotation")
-        viewmat = torch.eye(4, **DOUBLES)
-        viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ (eye * unit + self.frame.centre)
-        focal = 0.5 * max(width, height) / math.tan(0.5 * min(max(float(camera["fov"]), 0.01), 3.1))
-        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], **DOUBLES)
-        return View(viewmat, K, width, height, views.background, views.rasterize_mode, views.near_plane * unit)
-
-    def picture(self, wanted: dict[str, Any]) -> bytes:
-        """The picture that a page asks for, as JPEG. A quick one is drawn with fewer Gaussians. Errors as of
-        :meth:`view`."""
-        from PIL import Image
-
-        view, quick = self.view(wanted), bool(wanted["quick"])
-        kept = [levels.at(_percent(share)) for levels, share in zip(self.levels, wanted["kept"], strict=True)]
-        if len(kept) == 1 and kept[0] is not self.levels[0].whole:
-            kept.append(self.levels[0].whole)
-        scenes = [level.light if quick else level.scene for level in kept]
-        column = round(min(max(float(wanted["wipe"]), 0.0), 1.0) * view.width)
-        stream = io.BytesIO()
-        Image.fromarray(wiped(scenes, view, column)).save(stream, format="JPEG", quality=75 if quick else 95)
-        return stream.getvalue()
-
     def close(self, timeout: float) -> None:
         """Stop merging, and wait for it at most ``timeout`` seconds."""
-        for levels in self.levels:
-            levels.close(timeout)
+        for viewed in self.scenes:
+            viewed.close(timeout)
 
 
 class Viewer:
@@ -142,11 +88,7 @@ class Viewer:
         self._up, self._read = up, read
         self._working, self._dropping = threading.Lock(), threading.Lock()
         self._stage: _Stage | None = None
-        routes = {
-            "/": Route(self._page),
-            "/scene": Route(self._of_stage(self._scene), 1_024),
-            "/picture": Route(self._of_stage(self._picture), 4_096),
-        }
+        routes = {"/": Route(self._page), "/scene": Route(self._scene, 1_024)}
         if read is not None:
             routes["/drop"] = Route(self._drop, LARGEST_FILE)
         if scenes:
@@ -162,7 +104,8 @@ class Viewer:
 
     def wait(self) -> None:
         """Wait until Ctrl-C."""
-        threading.Event().wait()
+        while True:  # a signal that another thread got is seen when this one wakes
+            time.sleep(0.5)
 
     def __enter__(self) -> Viewer:
         return self
@@ -191,41 +134,25 @@ class Viewer:
         html = _live_page("Open a scene", None, True) if self._stage is None else self._stage.html
         return Answer(html, "text/html; charset=utf-8")
 
-    def _of_stage(self, answer: Callable[[_Stage, dict[str, Any]], Answer]) -> Callable[[Request], Answer]:
-        """A route for pages of the scenes that are shown; others get an answer to load again."""
-
-        def answered(request: Request) -> Answer:
-            wanted, stage = json.loads(request.body.read(request.length)), self._stage
-            if stage is None or wanted["stage"] != stage.number:
-                return Answer(status=HTTPStatus.CONFLICT)
-            return answer(stage, wanted)
-
-        return answered
-
-    def _scene(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
-        """A scene at a share, as SPZ if the page draws. A page that has one waits for a better one."""
+    def _scene(self, request: Request) -> Answer:
+        """A scene at a share, as SPZ unless the page has it. A page that has one waits for a better one; a page of
+        other scenes than those that are shown gets an answer to load again."""
+        wanted, stage = json.loads(request.body.read(request.length)), self._stage
+        if stage is None or wanted["stage"] != stage.number:
+            return Answer(status=HTTPStatus.CONFLICT)
         index, percent, have = int(wanted["scene"]), _percent(wanted["percent"]), str(wanted["have"])
-        levels = dict(enumerate(stage.levels))[index]
+        viewed = dict(enumerate(stage.scenes))[index]
         if not have:
-            levels.stop(percent)
-        level = (levels.merged(percent, 2.0) if have else None) or levels.at(percent)
-        whole = levels.ready(percent) is level
+            viewed.stop()
+        level = (viewed.merged(percent) if have else None) or viewed.at(percent)
+        whole = viewed.ready(percent) is level
         headers = {"X-State": json.dumps(stage.state(index, percent, level, whole))}
         if level.how == have or not wanted["spz"]:
             return Answer(status=HTTPStatus.NO_CONTENT, headers=headers)
         with self._working:
             # gzip's level 1 takes half of the time of 6, for 5 % more bytes, which go nowhere far.
-            level.spz = level.spz or stage.frame.encoded(level.scene, stage.scenes[index].name, level=1)
+            level.spz = level.spz or stage.frame.encoded(level.scene, viewed.name, level=1)
         return Answer(level.spz, "application/octet-stream", headers=headers)
-
-    def _picture(self, stage: _Stage, wanted: dict[str, Any]) -> Answer:
-        """What a page's camera sees, for browsers that cannot draw."""
-        with self._working:
-            try:
-                return Answer(stage.picture(wanted), "image/jpeg")
-            except RuntimeError as error:  # too little memory
-                logger.warning("cannot draw: %s", one_line(error))
-                return Answer(status=HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _drop(self, request: Request) -> Answer:
         """Take a dropped file, and show its scene. The client's name for it is shown to people. It is no path: only its
@@ -265,9 +192,14 @@ def _receive(request: Request, path: Path, suffix: str) -> None:
         raise SceneError(f"{path}: an empty file; expected a scene")
     if shutil.disk_usage(path.parent).free < 1.1 * request.length:
         raise SceneError(f"{path}: {request.length / 1e6:.0f} MB; the disk here has less room")
+    left = request.length
     with path.open("wb") as stream:
-        while data := request.body.read(1 << 20):
+        while left:
+            data = request.body.read(min(1 << 20, left))
+            if not data:
+                raise ValueError("the body is cut off")
             stream.write(data)
+            left -= len(data)
 
 
 def _percent(value: Any) -> int:
@@ -277,11 +209,3 @@ def _percent(value: Any) -> int:
 
 def _refused(text: str) -> Answer:
     return Answer(text.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)
-
-
-def _vector(values: Any) -> torch.Tensor:
-    """A vector (3,) of finite numbers, float64."""
-    vector = torch.tensor([float(value) for value in values], **DOUBLES)
-    if vector.shape != (3,) or not bool(vector.isfinite().all()):
-        raise ValueError("no vector")
-    return vector

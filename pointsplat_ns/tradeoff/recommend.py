@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.tradeoff.points import Point, speed_of
+from pointsplat_ns.tradeoff.points import Point
 
 PHOTO_PSNR = 27.0
 """Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
@@ -87,5 +87,5 @@ def _figures(point: Point, dense: Point, trusted: bool) -> str:
     figures = f"{point.gaussians:,} Gaussians, {bytes_text(point.bytes)} in place of {bytes_text(dense.bytes)}"
     if not trusted:
         return figures
-    speed = f"{speed_of(point, dense).median:.2g} times as fast"
+    speed = f"{point.speed.median:.2g} times as fast"
     return f"{figures}, {speed}: {point.frame_ms:.3g} ms a frame in place of {dense.frame_ms:.3g}"

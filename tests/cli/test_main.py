@@ -172,7 +172,7 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
     [
         ("view a.ply --port 8k", "port", 8000),
         ("view a.ply --port 1,000", "port", 1000),
-        ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
+        ("prune a.ply --memory 12kb", "memory", 0.012),
     ],
 )
 def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):

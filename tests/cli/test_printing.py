@@ -58,7 +58,7 @@ def test_prune_convert_and_export_say_what_they_wrote(ply, as_json):
     assert "gaussians_before" not in exported
 
 
-def test_lod_and_tradeoff_print_their_files(ply, as_json, plain_page, no_lpips, tmp_path, monkeypatch):
+def test_lod_and_tradeoff_print_their_files(ply, as_json, tmp_path, monkeypatch):
     assert as_json("lod", ply, "--levels", "50%") == {
         "output": "room_lod",
         **json.loads(Path("room_lod/lod.json").read_text("utf-8")),

@@ -163,7 +163,7 @@ def test_a_run_is_compacted_with_its_photos(trained_walls):
     (config,) = (trained_walls / "wall-a").rglob("config.yml")
     result = ps.compact(config.parent, "50%", effort="quick", photos=True)
     assert result.stages[-1].name == "photos" and result.photo_gain.after > 5
-    with pytest.raises(BudgetError, match="expected targets or photos"):
+    with pytest.raises(BudgetError, match="expected it without photos"):
         ps.compact(config.parent, photos=True, target_db=20)
 
 

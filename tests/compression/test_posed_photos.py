@@ -270,7 +270,7 @@ def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, sai
 
 
 @pytest.mark.parametrize("how", ["python", "prune", "tradeoff"])
-def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, said, capsys, plain_page, no_lpips):
+def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, said, capsys):
     shown = scene.replace(features_dc=scene.features_dc + 0.3) if how == "tradeoff" else scene
     folder, model = write_photos(shown, views, tmp_path / "images"), write_colmap_binary(views, tmp_path / "model")
     path = tmp_path / "room.ply"
@@ -301,7 +301,7 @@ TEXT = r"held-out photos: ([\d.]+) -> ([\d.]+) dB PSNR in 3 photos, of the dense
     [
         ({"views": "none"}, "photos need the file with their poses"),
         ({"data": "data"}, "the data of a run, but photos are read from"),
-        ({"target_db": 30}, "expected targets or photos"),
+        ({"target_db": 30}, "expected it without photos"),
         ({"views": "run.json"}, "no such file"),
     ],
 )

@@ -167,11 +167,10 @@ def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_p
 
 
 def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
-    made = ("room_pruned.ply", "room_compact.spz", "room_lod/level_0.ply", "room_tradeoff/room_10pct.ply")
+    made = ("room_pruned.ply", "room_compact.spz", "room_lod/level_0.ply")
     for name in ("room.sog", "other_compact.ply", "deep/room_pruned.ply", *made):
         save(cloud(50, 0, 1), tmp_path / name)
     (tmp_path / "room_lod" / "lod.json").touch()
-    (tmp_path / "room_tradeoff" / "tradeoff.json").touch()
     assert [scene.name for scene in find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
     assert f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text
 

@@ -200,8 +200,8 @@ def test_two_scenes_are_filmed_in_the_frame_of_the_first(tmp_path):
     one = scene.replace(offset=UTM)
     other = one.at_offset((UTM[0] + 3, UTM[1], UTM[2] - 1))
     views = ps.sample_views(scene, 1, width=64, height=48)
-    ps.render_path(one, tmp_path / "same", other=one, views=views, labels=[], fps=1)
-    ps.render_path(one, tmp_path / "moved", other=other, views=views, labels=[], fps=1)
+    ps.render_path(one, tmp_path / "same", other=one, views=views, fps=1)
+    ps.render_path(one, tmp_path / "moved", other=other, views=views, fps=1)
     frames = [min((tmp_path / folder).iterdir()) for folder in ("same", "moved")]
     pictures = [np.asarray(Image.open(path), np.float64) for path in frames]
     assert np.abs(pictures[0] - pictures[1]).max() <= 2

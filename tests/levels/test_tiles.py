@@ -16,9 +16,8 @@ import pointsplat_ns as ps
 from making import ball, normal_scene
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.earth import Place
-from pointsplat_ns.levels.errors import RenderErrors, pixel_size_for
+from pointsplat_ns.levels.errors import pixel_size_for
 from pointsplat_ns.levels.tiles import write_tiles
-from pointsplat_ns.looking.closeness import Closeness
 
 TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 """What viewers of 3D Tiles do to glTF."""
@@ -188,13 +187,6 @@ def test_levels_without_views_have_the_errors_of_their_sizes(tmp_path):
     assert max(tile["geometricError"] for tile, _ in tiles) == pytest.approx(wanted, rel=1e-5)
 
 
-def errors(*psnr: float) -> RenderErrors:
-    """Errors of a level by their PSNR at 1, 2, 4, ... times the distance, in one view that is covered whole."""
-    square = [10 ** (-value / 10) for value in psnr]
-    near = Closeness((square[0],), (1.0,))
-    return RenderErrors(near, {2 << index: value for index, value in enumerate(psnr[1:])})
-
-
 @pytest.mark.parametrize(
     ("psnr", "dense", "factor"),
     [
@@ -207,5 +199,5 @@ def errors(*psnr: float) -> RenderErrors:
     ],
 )
 def test_a_pixel_is_as_large_as_where_a_level_shows_enough(psnr, dense, factor):
-    found = pixel_size_for(errors(*psnr), dense, 0.01) / 0.01
+    found = pixel_size_for({1 << step: value for step, value in enumerate(psnr)}, dense, 0.01) / 0.01
     assert found == pytest.approx(factor) if factor else 1 / 8 <= found < 2

@@ -2,15 +2,23 @@
 
 import copy
 import dataclasses
+import shlex
+from pathlib import Path
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
+import pointsplat_ns as ps
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
+from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, carried, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
@@ -89,3 +97,40 @@ def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
         assert torch.equal(camera.camera_to_worlds, other.camera_to_worlds)
     seen = [lazy.next_eval(step)[1]["image_idx"] for step in range(len(ours))]
     assert sorted(seen) == list(range(len(ours)))
+
+
+@pytest.fixture()
+def run(trained_walls) -> Path:
+    """The run of SH degree 1 over white."""
+    (config,) = (trained_walls / "wall-b").rglob("config.yml")
+    return config.parent
+
+
+def mean_psnr(scene: Gaussians, run: Path) -> float:
+    """In the held-out photos of a run, dB."""
+    photos = run_photos(run, "test")
+    errors = [ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos]
+    return float(torch.stack(errors).mean())
+
+
+def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(PHOTO_STEPS, "quick", 96)
+    found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none", "photos"))
+    assert found.points[0].against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)
+    assert found.scene == "wall-b" and found.views_origin == "held-out photos of the dataset"
+    trained = next(point for point in found.points if point.repair == "photos")
+    pruned = next(point for point in found.points if point.repair == "none" and point.gaussians == trained.gaussians)
+    assert trained.against_photos.psnr > pruned.against_photos.psnr + 0.1
+    program, *words = shlex.split(trained.command)
+    assert program == "pointsplat" and "--photos" in words
+    monkeypatch.chdir(tmp_path)
+    main(words)
+    (made,) = tmp_path.glob("*.ply")
+    assert mean_psnr(ps.load(made), run) == pytest.approx(trained.against_photos.psnr, abs=0.01)
+
+
+def test_photos_of_no_run_are_refused(tmp_path):
+    ps.save(ps.example_room()[::200][:300], tmp_path / "room.ply")
+    with pytest.raises(ps.PointSplatError, match="not a nerfstudio run"):
+        ps.measure_tradeoff(tmp_path / "room.ply", tmp_path / "trade", repairs=("none", "photos"))
+    assert not (tmp_path / "trade" / "tradeoff.json").exists()

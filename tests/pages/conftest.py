@@ -6,7 +6,7 @@ import pytest
 
 import pointsplat_ns as ps
 from pointsplat_ns.gaussians import Gaussians
-from sweeps import room_views
+from room_views import room_views
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """A share of the slider is there at once by a score, and merged once a page waits for it."""
 
 import threading
-import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -12,7 +11,7 @@ import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import kept as module
-from pointsplat_ns.pages.kept import Level, Levels
+from pointsplat_ns.pages.kept import ViewedScene
 
 
 @pytest.fixture(scope="module")
@@ -21,18 +20,10 @@ def scene() -> ps.Gaussians:
 
 
 @pytest.fixture()
-def levels(scene) -> Iterator[Levels]:
-    made = Levels(scene, ViewSource(scene))
+def levels(scene) -> Iterator[ViewedScene]:
+    made = ViewedScene("ball", None, scene, ViewSource(scene))
     yield made
     made.close(5.0)
-
-
-def merged(levels: Levels, percent: int) -> Level:
-    """The merged level, asked for as pages do."""
-    end = time.monotonic() + 30
-    while (level := levels.merged(percent, 1.0)) is None:
-        assert time.monotonic() < end, levels.status
-    return level
 
 
 def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp_path, monkeypatch):
@@ -40,12 +31,11 @@ def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp
     shown = []
     monkeypatch.setattr("pointsplat_ns.pages.viewer.Viewer", lambda scenes, *rest: shown.extend(scenes))
     ps.open_viewer(tmp_path / "room")
-    (viewed,) = shown
-    made = Levels(viewed.scene, viewed.source, viewed.levels)
+    (made,) = shown
     for percent, how in ((50, "level 1 of the stream"), (10, "level 2 of the stream"), (30, "chosen by coverage")):
         level = made.at(percent)
         assert level.how == how and made.ready(percent) is (None if percent == 30 else level)
-        assert len(level.scene) == pytest.approx(percent * len(viewed.scene) / 100, rel=0.1)
+        assert len(level.scene) == pytest.approx(percent * len(made.scene) / 100, rel=0.1)
     made.close(5.0)
 
 
@@ -57,31 +47,28 @@ def test_a_share_is_there_at_once_by_coverage(levels, scene, percent):
 
 
 def test_a_share_that_is_waited_for_is_merged_as_prune_does(levels, scene):
-    assert same(merged(levels, 20).scene, ps.prune(scene, "20%"))
+    assert same(levels.merged(20).scene, ps.prune(scene, "20%"))
     assert levels.at(20) is levels.ready(20) and levels.at(20).how == "merged"
-    assert same(levels.at(100).scene, scene) and levels.merged(100, 0.0) is levels.whole
+    assert same(levels.at(100).scene, scene) and levels.merged(100) is levels.whole
 
 
-def test_merging_is_stopped_by_another_share_and_not_by_waiting_for_one(levels, monkeypatch):
-    stopped, begun = threading.Event(), threading.Event()
+def test_merging_is_stopped_by_the_choice_of_another_share(levels, monkeypatch):
+    begun, found = threading.Event(), []
 
-    def slow(merger, count, progress):
-        try:
-            while True:
-                begun.set()
-                progress(0.5)
-        except module.MergingStopped:
-            stopped.set()
-            raise
+    def endless(merger, count, progress):
+        begun.set()
+        while True:
+            progress(0.5)
 
-    monkeypatch.setattr(module.Merger, "merged", slow)
-    assert levels.merged(30, 0.0) is None and begun.wait(30)
-    assert levels.merged(10, 0.1) is None and not stopped.is_set()
-    assert levels.status in ("merging, 0 %", "merging, 50 %")
-    levels.stop(10)
-    assert stopped.wait(30)
+    monkeypatch.setattr(module.Merger, "merged", endless)
+    page = threading.Thread(target=lambda: found.append(levels.merged(30)))
+    page.start()
+    assert begun.wait(30)
+    levels.stop()
+    page.join(30)
+    assert found == [None] and levels.ready(30) is None
     monkeypatch.setattr(module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count)))
-    assert len(merged(levels, 10).scene) == 40
+    assert len(levels.merged(10).scene) == 40
 
 
 def test_failed_merging_leaves_what_was_chosen_and_says_why(levels, monkeypatch):
@@ -89,19 +76,19 @@ def test_failed_merging_leaves_what_was_chosen_and_says_why(levels, monkeypatch)
         raise ps.BudgetError("no such thing")
 
     monkeypatch.setattr(module.Merger, "merged", fails)
-    level = merged(levels, 50)
+    level = levels.merged(50)
     assert "no such thing" in level.how and len(level.scene) == 200
 
 
 def test_merged_levels_together_take_no_more_than_the_scene(levels, monkeypatch):
     monkeypatch.setattr(module.Merger, "merged", lambda _, count, progress: SimpleNamespace(scene=ball(count)))
     for percent in (40, 50, 60):
-        merged(levels, percent)
+        levels.merged(percent)
     assert [levels.ready(percent) is None for percent in (40, 50, 60)] == [True, True, False]
 
 
 def test_gaussians_that_cannot_be_drawn_are_left_out(scene):
     broken = scene.replace(means=scene.means.index_fill(0, torch.tensor([0, 7]), torch.nan))
-    made = Levels(broken, ViewSource(broken))
+    made = ViewedScene("ball", None, broken, ViewSource(broken))
     made.close(5.0)
     assert len(made.scene) == 398

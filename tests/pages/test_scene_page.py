@@ -1,7 +1,6 @@
 """The page of a scene and its pictures."""
 
 import base64
-import io
 import logging
 import math
 import re
@@ -22,8 +21,8 @@ from pointsplat_ns.looking.content import in_units, thinned
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.pages import html
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
-from pointsplat_ns.pages.pictures import ERROR_GAIN, error_colors, error_map, fit, read_png
-from sweeps import room_views
+from pointsplat_ns.pages.pictures import read_png
+from room_views import room_views
 
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(1)>\"'&</title>"
 
@@ -169,12 +168,6 @@ SEED = 3
 noise = np.random.default_rng(SEED).integers(0, 256, (12, 48, 64, 3), dtype=np.uint8)
 
 
-def decoded(uri: str) -> Image.Image:
-    kind, content = uri.split(",", 1)
-    assert kind == "data:image/webp;base64"
-    return Image.open(io.BytesIO(base64.b64decode(content, validate=True)))
-
-
 @pytest.mark.parametrize(
     ("content", "found"),
     [(None, "No such file"), (b"GIF89a", "not a PNG"), ("cut", "cannot be read"), ("wide", "48 x 64")],
@@ -195,30 +188,3 @@ def test_a_picture_that_cannot_be_used_is_one_line_with_its_path(tmp_path, conte
     text = str(error.value)
     assert text.startswith(str(path)) and found in text and "expected a PNG picture of 64 x 48" in text
     assert "\n" not in text
-
-
-def test_an_error_map_shows_the_mean_of_the_largest_difference_amplified():
-    picture = noise[0].copy()
-    other = picture.astype(int)
-    other[:2, :2, 0] += np.array([[8, 4], [0, 0]]) * np.where(picture[:2, :2, 0] < 128, 1, -1)
-    other[:2, :2, 2] += np.array([[2, 2], [2, 2]]) * np.where(picture[:2, :2, 2] < 128, 1, -1)
-    shown = error_map(other.astype(np.uint8), picture)
-    assert shown.shape == (24, 32, 3)
-    assert np.array_equal(shown[0, 0], error_colors()[round(ERROR_GAIN * (8 + 4 + 2 + 2) / 4)])
-    assert not shown[1:].any() and not shown[0, 1:].any()
-
-
-def test_pictures_are_kept_well_where_there_is_room():
-    uris, how = fit([lambda i=i: noise[i] for i in range(4)], 10**6)
-    assert [decoded(uri).size for uri in uris] == [(64, 48)] * 4 and how == "WebP of quality 90"
-
-
-def test_pictures_are_made_smaller_where_quality_alone_is_not_enough():
-    big = np.random.default_rng(SEED).integers(0, 256, (300, 400, 3), dtype=np.uint8)
-    [uri], how = fit([lambda: big], 45_000)
-    assert decoded(uri).size == (160, 120) and how.endswith("at most 160 pixels wide or high")
-
-
-def test_pictures_that_cannot_fit_are_an_error():
-    with pytest.raises(DataError, match="12 pictures do not fit into 0.0 MB"):
-        fit([lambda i=i: noise[i] for i in range(12)], 1_000)

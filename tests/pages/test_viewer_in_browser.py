@@ -81,29 +81,21 @@ def keep(browser, index: int, percent: int) -> None:
     browser.execute_script(script, browser.find_elements(By.CSS_SELECTOR, "[data-kept]")[index], percent)
 
 
-def test_a_browser_without_webgl_gets_the_same_picture(page):
-    page.execute_script("flight.reset(); flight.setWipe(0.5)")
-    shrink(page)
-    expected, address = picture(page), page.current_url
-    middle = expected.shape[1] // 2
-    assert expected[:, : middle - 4].mean() > 1.5 * expected[:, middle + 4 :].mean(), "the first scene is brighter"
+def test_a_browser_without_webgl_says_so(page):
     without = """const original = HTMLCanvasElement.prototype.getContext;
       HTMLCanvasElement.prototype.getContext = function (name, ...rest) {
         return name === "webgl2" ? null : original.call(this, name, ...rest);
       };"""
+    address = page.current_url
     with before_pages_load(page, without):
         page.get(address)
-        waited(lambda: still(page), "a picture")
-        shrink(page)
-        assert page.execute_script("return flight.drawer instanceof Pictures")
-        shown = picture(page)
-        middle = shown.shape[1] // 2
-        for part in (slice(0, middle - 3), slice(middle + 3, None)):  # without the line
-            assert ps.psnr(shown[:, part], expected[:, part]) > 30, "dB: SPZ and JPEG differ from the scene"
-        page.execute_script("flight.camera.turn(0.3, 0); flight.change()")
-        assert ps.psnr(picture(page), shown) < 25, "dB: the camera has turned"
+        waited(lambda: "This browser offers no WebGL 2" in text_of(page), "what is missing")
     page.get(address)
     waited(lambda: still(page), "a picture")
+    shrink(page)
+    shown = picture(page)
+    middle = shown.shape[1] // 2
+    assert shown[:, : middle - 4].mean() > 1.5 * shown[:, middle + 4 :].mean(), "the first scene is brighter"
 
 
 def test_budget_changes_the_count_at_once_and_is_merged(page):

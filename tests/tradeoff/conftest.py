@@ -1,4 +1,4 @@
-"""A small room that sweeps measure within seconds."""
+"""A small room that is measured within seconds."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,10 +8,9 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.tradeoff.making import Subject
-from pointsplat_ns.tradeoff.table import Sweep
+from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.views import Views
 
 
@@ -30,13 +29,14 @@ def room_views(room) -> Views:
 
 
 @pytest.fixture()
-def new_sweep(room, room_views, plain_page, no_lpips, monkeypatch) -> Callable[..., Sweep]:
-    """A function (folder, options) that begins a sweep of the room, whose repairs take two steps."""
+def measured(room, room_views, tmp_path, monkeypatch) -> Callable[..., Tradeoff]:
+    """A function that measures the room in these views, by default merged to a tenth, to the folder ``out``. Repairs
+    take two steps."""
     monkeypatch.setitem(repair.STEPS, "quick", 2)
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
 
-    def begin(folder: Path, held_out=None, sha256="sum", **options) -> Sweep:
-        dense = ps.load(room)
-        subject = Subject(dense, room, "room", lambda: ViewSource(dense, given=room_views), held_out)
-        return Sweep(subject, sha256, folder, **{"progress": lambda what, share: None, **options})
+    def measure(**options) -> Tradeoff:
+        usual = {"keep": ["10%"], "repairs": ["none"]}
+        return ps.measure_tradeoff(room, tmp_path / "out", **{**usual, **options})
 
-    return begin
+    return measure

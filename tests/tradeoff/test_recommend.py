@@ -8,30 +8,8 @@ import torch
 
 import pointsplat_ns as ps
 from pointsplat_ns.tradeoff import measuring
-from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting
 from pointsplat_ns.tradeoff.recommend import PHOTO_PSNR, expected_loss, fastest_within, recommend
-from trades import point
-
-ALL = Setting(100_000, 3, by=DENSE)
-
-
-def made(key: str, ms: float, renders: float, photos: float, size: int = 100) -> Point:
-    setting = replace(ALL, count=size) if key == "dense" else Setting(size, 3)
-    return replace(
-        point(setting, renders, ms, photos, of=100, key=key),
-        against_dense=ImageMetrics(renders, 1 - 1 / renders),
-        against_photos=ImageMetrics(photos, 1 - 1 / photos, 1 / photos),
-        bytes=size,
-    )
-
-
-POINTS = [
-    made("dense", 100, math.inf, 30.1),
-    made("half", 60, 42.0, 30.0, 50),
-    made("slow", 70, 35.0, 29.9, 60),  # beaten by half in everything
-    made("third", 40, 36.0, 29.6, 30),
-    made("tenth", 20, 30.0, 28.0, 10),
-]
+from trades import POINTS, point
 
 
 @pytest.mark.parametrize(("loss", "key"), [(0, "dense"), (0.1, "half"), (0.49, "half"), (0.5, "third"), (3, "tenth")])
@@ -64,11 +42,12 @@ def test_the_expected_loss_is_that_of_independent_errors():
 
 
 def test_the_fastest_within_the_loss_is_recommended_not_the_smallest():
-    dense = point(ALL, math.inf, 100.0)
-    slow, fast, poor = (point(Setting(n, 3), db, ms) for n, db, ms in ((500, 40, 30), (900, 37, 20), (100, 20, 5)))
-    best, why = recommend([dense, slow, fast, poor], 0.5)
+    dense, slow, fast = (point(*some) for some in (
+        ("dense", 100, math.inf, None, 1000), ("slow", 30, 40.0, None, 500), ("fast", 20, 37.0, None, 900),
+    ))  # fmt: skip
+    best, why = recommend([dense, slow, fast, point("poor", 5, 20.0, None, 100)], 0.5)
     limit = "has at least 36.1 dB against the dense scene's renders (about 0.5 dB lost against photos): "
-    assert best is fast and why.startswith(f"the fastest point that {limit}{fast.label}, 900 Gaussians")
+    assert best is fast and why.startswith(f"the fastest point that {limit}the fast, 900 Gaussians")
     assert "20 ms a frame in place of 100" in why
     best, why = recommend([dense, fast, slow], 0.5, trusted=False)
     assert best is slow and why.startswith(f"the point with the fewest Gaussians that {limit}") and "ms" not in why
@@ -76,12 +55,12 @@ def test_the_fastest_within_the_loss_is_recommended_not_the_smallest():
 
 @pytest.mark.parametrize("photos, loss", [((30.0, 25.0, 27.75), "2.25 dB:"), ((None,) * 3, "1.76 dB (estimated):")])
 def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
-    settings = (ALL, math.inf, 100.0), (Setting(100, 3), 20.0, 5.0), (Setting(10_000, 3), 30.0, 50.0)
-    dense, poor, other = (point(*some, photos=db) for some, db in zip(settings, photos, strict=True))
+    settings = ("dense", 100, math.inf, photos[0], 500), ("poor", 5, 20.0, photos[1], 1), ("b", 50, 30.0, photos[2], 90)
+    dense, poor, other = (point(*some) for some in settings)
     best, why = recommend([dense, poor, other], 0.5)
     limit = "loses at most 0.5 dB against held-out photos" if photos[0] else "has at least 36.1 dB against"
     assert best is dense and why.startswith(f"no point that is faster than the dense scene {limit}")
-    assert f"; the next best, {other.label}, loses {loss} 10,000 Gaussians, 2.48 MB in place of 24.8 MB, " in why
+    assert f"; the next best, the b, loses {loss} 90 Gaussians, 0.900 kB in place of 5.00 kB, " in why
     assert "50 ms a frame in place of 100, made in 3 s" in why
     assert "next best" not in recommend([dense], 0.5)[1]
 

@@ -1,183 +1,136 @@
-"""Sweeps: the table, what is kept of it whatever happens, and that its commands make the same scenes."""
+"""The table: what is measured, what is kept of it whatever happens, and that its commands make the same scenes."""
 
-import csv
 import json
 import math
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression import repair
+from pointsplat_ns.compression import compact, repair
 from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import ply_bytes
-from pointsplat_ns.tradeoff import measuring
-from pointsplat_ns.tradeoff.making import Subject, make, settings_of
-from pointsplat_ns.tradeoff.points import DENSE, REPAIRS, RESULTS, Setting, Tradeoff, picture_path, write_points
-from trades import point
-
-TENTH = [Setting(40, 1)]
-
-
-def names(folder):
-    return sorted(path.name for path in folder.iterdir())
+from pointsplat_ns.tradeoff import measuring, table
+from pointsplat_ns.tradeoff.making import Subject, make
+from pointsplat_ns.tradeoff.measuring import views_to_judge
+from pointsplat_ns.tradeoff.points import DENSE, REPAIRS, Setting
+from pointsplat_ns.tradeoff.table import settings_of
 
 
-def test_a_sweep_leaves_a_table_pictures_scenes_and_a_page(new_sweep, tmp_path):
-    result = new_sweep(tmp_path).run(TENTH)
-    assert [point.key for point in result.points] == ["dense", "10pct_sh1"]
-    assert names(tmp_path) == ["pictures", "scenes", "tradeoff.csv", "tradeoff.html", "tradeoff.json"]
-    with (tmp_path / RESULTS["table"]).open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["key"] for row in rows] == [point.key for point in result.points]
-    assert float(rows[1]["against_dense_psnr"]) == result.points[1].against_dense.psnr
-    assert rows[1]["against_photos_psnr"] == "" and float(rows[0]["speed_median"]) == 1
-    content = json.loads((tmp_path / RESULTS["json"]).read_text())
-    assert content["points"][0]["against_dense"]["psnr"] is None, "infinite"
-    assert content["recommended"] == result.recommended
-    for shown in result.points:
-        assert all(picture_path(tmp_path, view, shown.key).is_file() for view in range(3))
-    assert names(tmp_path / "scenes") == ["10pct_sh1.json", "dense.json"]
-    assert (tmp_path / RESULTS["page"]).read_text().split() == [point.key for point in result.points]
+def test_the_figures_are_returned_and_written_beside_a_page(measured, tmp_path, monkeypatch):
+    monkeypatch.setattr(measuring, "_timed", lambda scene, view: 1e-5 * len(scene))
+    heard: dict[str, list[float]] = {}
+    found = measured(progress=lambda what, share: heard.setdefault(what, []).append(share))
+    assert [point.key for point in found.points] == ["dense", "10pct"] and found.points[1].gaussians == 40
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["tradeoff.html", "tradeoff.json"]
+    content = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
+    dense, tenth = content["points"]
+    assert dense["against_dense"]["psnr"] is None, "infinite" and dense["speed"]["median"] == 1
+    assert tenth["against_dense"]["psnr"] == found.points[1].against_dense.psnr and tenth["against_photos"] is None
+    assert (dense["frame_ms"], tenth["frame_ms"]) == pytest.approx((4.0, 0.4))
+    assert [*tenth["speed"].values()] == pytest.approx([10.0, 10.0, 10.0])
+    assert content["recommended"] == found.recommended
+    assert heard["point 2 of 2: timing frames"] == [pytest.approx(frame / 9) for frame in range(1, 10)]
+    with pytest.raises(SceneError, match="tradeoff.json: exists already"):
+        measured()
+    assert measured(force=True).points[1].against_dense == found.points[1].against_dense
 
 
 def test_the_table_has_each_combination_once(room):
-    options = ("50%", 200, "10%"), ("merge", "opacity"), ("all", "0", "3"), ("none", "quick")
-    settings = settings_of(ps.load(room), *options)
-    wanted = {
-        Setting(count, degree, repair, by)
-        for count in (200, 40)
-        for degree in (0, 1)
-        for repair in ("none", "quick")
-        for by in ("merge", "opacity")
-    }
-    assert set(settings) == wanted and len(settings) == len(wanted)
+    settings = settings_of(ps.load(room), ("50%", 200, "10%"), ("merge", "opacity"), ("quick", "none"))
+    ways = [(count, repair, by) for count in (200, 40) for repair in ("none", "quick") for by in ("merge", "opacity")]
+    assert settings == [Setting(400, by=DENSE), *(Setting(*way) for way in ways)]
 
 
 @pytest.mark.parametrize("after", [0, 2])
-def test_an_interrupted_sweep_keeps_what_it_measured_and_goes_on(new_sweep, tmp_path, monkeypatch, after):
-    made, table = [], [Setting(count, 1) for count in (200, 120, 40)]
+def test_an_interruption_keeps_what_was_measured(measured, tmp_path, monkeypatch, after):
+    made = []
 
-    def interrupted(dense, setting, *args):
+    def interrupted(subject, setting, progress):
         if len(made) == after:
             raise KeyboardInterrupt
         made.append(setting)
-        return make(dense, setting, *args)
+        return make(subject, setting, progress)
 
-    monkeypatch.setattr(measuring, "make", interrupted)
+    monkeypatch.setattr(table, "make", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        new_sweep(tmp_path).run(table)
-    content = json.loads((tmp_path / RESULTS["json"]).read_text())
+        measured(keep=["50%", "30%", "10%"])
+    content = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
     assert len(content["points"]) == 1 + after and any("interrupted" in note for note in content["notes"])
-    made.clear()
-    monkeypatch.setattr(measuring, "make", lambda *args: (made.append(args[1]), make(*args))[1])
-    resumed = new_sweep(tmp_path).run(table)
-    assert len(resumed.points) == 4 and len(made) == 3 - after, "nothing is measured twice"
-    whole = new_sweep(tmp_path / "whole").run(table)
-    assert [(p.key, p.against_dense) for p in resumed.points] == [(p.key, p.against_dense) for p in whole.points]
-    assert not any("interrupted" in note for note in resumed.notes)
 
 
-def test_the_bar_names_the_point_and_moves_with_every_view(new_sweep, tmp_path):
-    heard: dict[str, list[float]] = {}
-    new_sweep(tmp_path, progress=lambda what, share: heard.setdefault(what, [0.0]).append(share)).run(TENTH)
-    for number in (1, 2):
-        assert heard[f"point {number} of 2: comparing"] == [0, 1], "no photos, and no LPIPS"
-        assert heard[f"point {number} of 2: timing frames"] == [
-            0,
-            *(pytest.approx(frame / 9) for frame in range(1, 10)),
-        ]
-    assert any(what.startswith("point 2 of 2: by merge") for what in heard)
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SceneError])
+def test_what_ends_before_the_first_point_leaves_nothing(error, measured, tmp_path, monkeypatch):
+    def failing(*_):
+        raise error("now")
+
+    monkeypatch.setattr(measuring, "_timed", failing)
+    with pytest.raises(error):
+        measured()
+    assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_during_a_repair_is_no_shorter_repair(new_sweep, tmp_path, monkeypatch):
-    from pointsplat_ns.compression import compact
-
+def test_ctrl_c_during_a_repair_is_no_shorter_repair(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(compact, "repair", lambda scene, *_, **others: Repaired(scene, 1, 0.1, interrupted=True))
     with pytest.raises(KeyboardInterrupt):
-        new_sweep(tmp_path).run([Setting(40, 1, "quick")])
-    assert len(json.loads((tmp_path / RESULTS["json"]).read_text())["points"]) == 1
+        measured(repairs=["quick"])
+    assert len(json.loads((tmp_path / "out" / "tradeoff.json").read_text())["points"]) == 1
 
 
-def test_a_point_whose_pictures_are_gone_is_measured_again(new_sweep, tmp_path):
-    [_, first] = new_sweep(tmp_path).run(TENTH).points
-    picture_path(tmp_path, 1, first.key).unlink()
-    [_, again] = new_sweep(tmp_path).run(TENTH).points
-    assert picture_path(tmp_path, 1, first.key).is_file() and again.against_dense == first.against_dense
+def with_photos(monkeypatch, held_out) -> None:
+    """Let the scene have held-out photos."""
+    original = table.subject_at
+    monkeypatch.setattr(table, "subject_at", lambda *words: replace(original(*words), held_out=held_out))
 
 
-def test_held_out_photos_are_what_scenes_are_judged_by(new_sweep, tmp_path, room, room_views):
+def test_held_out_photos_are_what_scenes_are_judged_by(measured, room, room_views, monkeypatch):
     photos = [Example(view, (ps.render(ps.load(room), view) + 0.05).clamp(0, 1)) for view in room_views]
-    result = new_sweep(tmp_path, lambda: photos, views=2).run(TENTH)
-    assert result.views_origin == "held-out photos of the dataset" and "held-out photos" in result.why
-    assert result.points[0].against_photos.psnr < 40 and result.points[0].against_dense.psnr == math.inf
-    assert result.points[1].against_photos is not None
-    assert len(list((tmp_path / "pictures").glob("*_photo.png"))) == 2
+    with_photos(monkeypatch, lambda: photos)
+    found = measured(views=2)
+    assert found.views_origin == "held-out photos of the dataset" and "held-out photos" in found.why
+    assert found.points[0].against_photos.psnr < 40 and found.points[0].against_dense.psnr == math.inf
+    assert found.points[1].against_photos.psnr < found.points[0].against_photos.psnr
 
 
-def test_photos_that_cannot_be_had_are_named_and_left_out(new_sweep, tmp_path):
+def test_photos_that_cannot_be_had_are_named_and_left_out(measured, monkeypatch):
     def gone():
         raise DataError("photo_3.jpg: no such file")
 
-    result = new_sweep(tmp_path, gone).run(TENTH)
-    assert result.points[1].against_photos is None and result.views_origin == "given views"
-    assert "there are no held-out photos: photo_3.jpg: no such file" in result.notes
+    with_photos(monkeypatch, gone)
+    found = measured()
+    assert found.points[1].against_photos is None and found.views_origin.startswith("sampled poses")
+    assert "there are no held-out photos: photo_3.jpg: no such file" in found.notes
 
 
-@pytest.fixture(scope="module")
-def content(tmp_path_factory, room, room_views) -> dict:
-    """The JSON of a sweep of the room."""
-    folder, points = tmp_path_factory.mktemp("json"), (point(Setting(400, 1, by=DENSE), math.inf, of=400),)
-    write_points(Tradeoff("room", "m", "v", 48, 36, (*points, point(Setting(40, 1), 31.25, photos=27.5))), {}, folder)
-    return json.loads((folder / RESULTS["json"]).read_text())
+def test_photos_are_reduced_with_their_views_by_the_mean_of_each_area(room, room_views):
+    dense = ps.load(room)
+    photo, mask = torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0)), torch.arange(48) < 25
+    photos = [Example(view, photo, mask.expand(36, -1)[..., None]) for view in room_views]
+    turned = Example(replace(room_views[0], width=36, height=48), photo.transpose(0, 1))
+    subject = Subject(dense, room, lambda: ViewSource(dense), lambda: [turned, *photos[1:]])
+    (views, small, _), note = views_to_judge(replace(subject, resolution=(24, 18)), 3)
+    assert (len(views), views.width, views.height) == (2, 24, 18) and note.startswith("1 of 3 held-out photos")
+    assert torch.equal(views.viewmats, room_views.viewmats[1:])
+    assert torch.allclose(small[0].target, photo.reshape(18, 2, 24, 2, 3).mean(dim=(1, 3)), atol=1e-6)
+    assert small[0].mask.sum() == 18 * 13
+    whole = views_to_judge(replace(subject, held_out=lambda: photos), 3)[0]
+    assert torch.equal(whole.photos[0].target, photo) and torch.equal(whole.views.Ks, room_views.Ks)
 
 
-@pytest.mark.parametrize(
-    "change, said",
-    [
-        (lambda content: content["points"][1].update(gaussians="many"), "gaussians is 'many'"),
-        (lambda content: content["points"][1].update(gaussians=-1), "gaussians is -1"),
-        (lambda content: content["points"][1].update(frame_ms=math.nan), "frame_ms is nan"),
-        (lambda content: content["points"][1]["against_photos"].update(ssim="good"), "ssim is 'good'"),
-        (lambda content: content["points"][1].update(repair="magic"), ""),
-        (lambda content: content["points"][1].update(by="magic"), "no method is called 'magic'"),
-        (lambda content: content["points"][1].pop("key"), "key"),
-        (lambda content: content.pop("points"), "lacks 'points'"),
-        (lambda content: content["points"].append(None), "not iterable"),
-        (lambda content: content.update(version=3), "of version 3, this program's are of 6"),
-        *((text, "") for text in ("", "[]", "null", "[" * 100_000, "\x00\xff")),
-    ],
-)
-def test_a_json_of_something_else_is_refused_in_one_line(new_sweep, tmp_path, content, change, said):
-    content = json.loads(json.dumps(content))
-    if not isinstance(change, str):
-        change(content)
-    (tmp_path / RESULTS["json"]).write_text(change if isinstance(change, str) else json.dumps(content))
-    with pytest.raises(SceneError, match=f"tradeoff.json: not the points of a sweep .*{said}.*--force") as refused:
-        new_sweep(tmp_path)
-    assert len(str(refused.value).splitlines()) == 1
-
-
-def test_points_of_another_scene_are_refused_and_keys_are_not_taken_from_files(new_sweep, tmp_path):
-    new_sweep(tmp_path).run(TENTH)
-    with pytest.raises(SceneError, match="its points are of another sweep .scene: 'sum', now 'another'"):
-        new_sweep(tmp_path, sha256="another")
-    path = tmp_path / RESULTS["json"]
-    path.write_text(path.read_text().replace('"key": "10pct_sh1"', '"key": "../../away"'))
-    assert {point.key for point in new_sweep(tmp_path).points.values()} == {"dense", "10pct_sh1"}
-
-
-def test_results_without_points_are_not_overwritten(tmp_path):
-    (tmp_path / RESULTS["table"]).write_text("precious")
-    with pytest.raises(SceneError, match="exists already, without tradeoff.json"):
-        ps.measure_tradeoff(tmp_path / "gone.ply", tmp_path)
+def test_pictures_too_small_for_ssim_are_refused(measured, room_views, monkeypatch):
+    views = replace(room_views, width=10)
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views)
+    with pytest.raises(DataError, match="views are 10 x 36 pixels; expected at least 11 a side"):
+        measured()
 
 
 @pytest.mark.parametrize(
@@ -185,12 +138,10 @@ def test_results_without_points_are_not_overwritten(tmp_path):
     [
         ({"keep": ("much",)}, "keep is 'much'"),
         ({"keep": ()}, "no budget or no method"),
-        ({"by": ()}, "no budget or no method"),
         ({"by": ("magic",)}, "no method is called 'magic'"),
-        ({"sh": ("4",)}, "sh: 4; expected some of all, 0"),
         ({"within": math.nan}, "a loss of nan dB"),
         ({"views": 0}, "0 views"),
-        ({"repairs": ("magic",)}, "repairs: magic; expected some of none, refiner, quick"),
+        ({"repairs": ("magic",)}, "repairs: magic; expected some of none, quick"),
         ({"repairs": ()}, "repairs: empty"),
     ],
 )
@@ -199,33 +150,44 @@ def test_options_that_mean_nothing_are_refused_before_the_scene_is_read(tmp_path
         ps.measure_tradeoff(tmp_path / "gone.ply", tmp_path / "out", **options)
 
 
-SETTINGS = [Setting(40, 1), Setting(40, 1, "refiner"), Setting(40, 0, "quick", "paper"), Setting(40, 1, by="coverage")]
+SETTINGS = [Setting(40), Setting(40, "quick", "paper"), Setting(40, by="coverage")]
 
 
-@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: f"{setting.count} {setting.repair} {setting.by}")
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: f"{setting.repair} {setting.by}")
 def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, tmp_path, monkeypatch):
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     monkeypatch.setattr(view_source.Sampler, "views", lambda *args, **options: room_views)
     monkeypatch.chdir(tmp_path)
     path, dense = Path("the room.ply"), ps.load(room)
     path.write_bytes(room.read_bytes())
-    subject = Subject(dense, path, "room", lambda: ViewSource(dense))
-    made = make(dense, setting, subject.new_views, lambda what, share: None)
-    assert (len(made.scene), made.scene.sh_degree) == (setting.count, setting.sh_degree)
-    program, *words = shlex.split(subject.names(setting)["command"])
+    subject = Subject(dense, path, lambda: ViewSource(dense))
+    made, names = make(subject, setting, lambda what, share: None), subject.names(setting)
+    program, *words = shlex.split(names["command"])
     assert program == "pointsplat"
     main(words)
-    written = Path(f"room_{subject.names(setting)['key']}.ply")
-    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == ply_bytes(
-        setting.count, setting.sh_degree
-    )
+    written = Path(f"the-room_{names['key']}.ply")
+    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == ply_bytes(setting.count, 1)
 
 
 def test_keys_differ_and_fit_into_names_of_files(room):
-    subject = Subject(ps.load(room), room, "room", lambda: None)
-    repairs = [Setting(40, 1, repair) for repair in REPAIRS]
-    keys = [
-        subject.names(s)["key"] for s in (*repairs, Setting(40, 0), Setting(41, 1), Setting(40, 1, by="log-volume"))
-    ]
+    subject = Subject(ps.load(room), room, lambda: None)
+    settings = [*(Setting(40, repair) for repair in REPAIRS), Setting(41), Setting(40, by="log-volume")]
+    keys = [subject.names(setting)["key"] for setting in settings]
     assert len(set(keys)) == len(keys)
     assert all(character.isalnum() or character in "._-" for key in keys for character in key)
+
+
+@pytest.mark.parametrize("resolution", [None, "96x54"])
+def test_scenes_are_judged_in_the_views_that_compact_compares_in(room, tmp_path, monkeypatch, resolution):
+    monkeypatch.setattr(view_source, "RESOLUTION", (512, 384))  # which decisions are made at, if nothing is asked for
+    monkeypatch.setattr(view_source, "VIEW_COUNTS", replace(view_source.VIEW_COUNTS, compared=3))
+    wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
+    judged, original = [], measuring.views_to_judge
+
+    def watched(*args):
+        judged.append(original(*args)[0].views)
+        return original(*args)
+
+    monkeypatch.setattr(measuring, "views_to_judge", watched)
+    ps.measure_tradeoff(room, tmp_path, keep=["50%"], by=["opacity"], repairs=["none"], resolution=resolution)
+    assert judged[0].viewmats.equal(wanted.viewmats) and judged[0].Ks.equal(wanted.Ks)

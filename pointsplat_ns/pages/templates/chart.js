@@ -1,15 +1,6 @@
 "use strict";
 
-// A scatter of points with their Pareto front, drawn as SVG at the width that there is. Points are the options of a
-// listbox: one of them is in the order of tabs, and arrow keys go to its neighbours.
-
-const SHAPES = [
-  (r) => `M${-r} 0a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0z`,
-  (r) => `M${-r * 0.9} ${-r * 0.9}h${r * 1.8}v${r * 1.8}h${-r * 1.8}z`,
-  (r) => `M0 ${-r * 1.2}L${r * 1.15} ${r * 0.85}H${-r * 1.15}z`,
-  (r) => `M0 ${-r * 1.3}L${r * 1.3} 0L0 ${r * 1.3}L${-r * 1.3} 0z`,
-  (r) => `M0 ${r * 1.2}L${r * 1.15} ${-r * 0.85}H${-r * 1.15}z`,
-];
+// A scatter of points, of which those of one group are joined, drawn as SVG at the width that there is.
 
 function element(parent, name, attributes = {}, text = "") {
   const made = parent.ownerDocument.createElementNS(parent.namespaceURI, name);
@@ -23,106 +14,50 @@ function steps(low, high, most) {
   const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * [1, 2, 5, 10].find((factor) => factor * power >= rough);
   const ticks = [];
-  for (let i = Math.ceil(low / step - 1e-9); i * step <= high * (1 + 1e-9); i++) ticks.push(Number((i * step).toPrecision(12)));
+  for (let i = Math.ceil(low / step); i * step <= high; i++) ticks.push(i * step);
   return ticks;
 }
 
-// Ticks of a logarithmic axis: round factors in each decade, as many as fit; equal distances where it is short.
+// Ticks of a logarithmic axis: 1, 2 and 5 of each decade; equal distances where it is short.
 function logSteps(low, high, most) {
-  if (high / low < 4) return steps(low, high, most);
-  for (const factors of [[1, 1.5, 2, 3, 4, 5, 7], [1, 2, 3, 5], [1, 2, 5], [1, 3], [1]]) {
-    const ticks = [];
-    for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++)
-      ticks.push(...factors.map((factor) => factor * 10 ** power).filter((tick) => tick >= low && tick <= high));
-    if (ticks.length <= most) return ticks;
-  }
-  return [];
+  if (high / low < 8) return steps(low, high, most);
+  const ticks = [];
+  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++) ticks.push(...[1, 2, 5].map((factor) => factor * 10 ** power));
+  return ticks.filter((tick) => tick >= low && tick <= high);
 }
 
-// `points` have x, y (which may be infinite), low, high (null: no spread), label, title, group; `front` is a list of
-// indices.
-function drawChart(svg, { points, front, selected, marked, threshold, xTitle, yTitle, xText, yText, lessIsBetter, onSelect, onPoint }) {
-  const width = svg.parentNode.clientWidth, small = width < 560, height = small ? 300 : 400;
-  const left = 58, right = 18, bottom = 46;
-  const someInfinite = points.some((point) => point.y === Infinity);
-  const top = someInfinite ? 52 : 22;
-  const finite = points.map((point) => point.y).filter(Number.isFinite);
-  if (Number.isFinite(threshold)) finite.push(threshold);
-  let low = Math.min(...finite), high = Math.max(...finite);
-  if (!finite.length) [low, high] = [0, 1];
-  const pad = (high - low) * 0.08 || Math.abs(high) * 0.05 || 1;
-  [low, high] = [low - pad, high + pad];
-  const xs = points.flatMap((point) => [point.x, point.low ?? point.x, point.high ?? point.x]);
-  const xLow = Math.min(...xs) / 1.15, xHigh = Math.max(...xs) * 1.15;
+// `points` have x, y, group (-1 is in no line), key and title.
+function drawChart(svg, { points, selected, xTitle, yTitle, onSelect }) {
+  const width = svg.parentNode.clientWidth, height = width < 560 ? 300 : 400, most = width < 560 ? 5 : 8;
+  const left = 58, right = 18, top = 16, bottom = 46;
+  const [xs, ys] = [points.map((point) => point.x), points.map((point) => point.y)];
+  const [xLow, xHigh] = [Math.min(...xs) / 1.15, Math.max(...xs) * 1.15];
+  const pad = 0.08 * (Math.max(...ys) - Math.min(...ys)) || 1, [yLow, yHigh] = [Math.min(...ys) - pad, Math.max(...ys) + pad];
   const x = (value) => left + ((width - left - right) * Math.log(value / xLow)) / Math.log(xHigh / xLow);
-  const y = (value) => {
-    if (value === Infinity) return 22;
-    const share = (value - low) / (high - low);
-    return top + (height - top - bottom) * (lessIsBetter ? share : 1 - share);
-  };
+  const y = (value) => height - bottom - ((height - top - bottom) * (value - yLow)) / (yHigh - yLow);
+  const text = (value) => `${+value.toPrecision(4)}`;
   svg.replaceChildren();
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-  svg.setAttribute("height", height);
-  const axes = element(svg, "g", { class: "axes", "aria-hidden": "true" });
-  for (const tick of logSteps(xLow, xHigh, small ? 5 : 9)) {
-    element(axes, "line", { x1: x(tick), x2: x(tick), y1: 12, y2: height - bottom });
-    element(axes, "text", { x: x(tick), y: height - bottom + 18, "text-anchor": "middle" }, xText(tick));
+  const axes = element(svg, "g", { class: "axes" });
+  if (!points.length) return;
+  for (const tick of logSteps(xLow, xHigh, most)) {
+    element(axes, "line", { x1: x(tick), x2: x(tick), y1: top, y2: height - bottom });
+    element(axes, "text", { x: x(tick), y: height - bottom + 18, "text-anchor": "middle" }, text(tick));
   }
-  for (const tick of steps(low, high, small ? 5 : 7)) {
+  for (const tick of steps(yLow, yHigh, most)) {
     element(axes, "line", { x1: left, x2: width - right, y1: y(tick), y2: y(tick) });
-    element(axes, "text", { x: left - 8, y: y(tick) + 4, "text-anchor": "end" }, yText(tick));
+    element(axes, "text", { x: left - 8, y: y(tick) + 4, "text-anchor": "end" }, text(tick));
   }
-  if (someInfinite) {
-    element(axes, "line", { x1: left, x2: width - right, y1: 22, y2: 22, class: "infinite" });
-    element(axes, "text", { x: left - 8, y: 26, "text-anchor": "end" }, "∞");
+  element(axes, "text", { x: (left + width - right) / 2, y: height - 8, "text-anchor": "middle" }, xTitle);
+  element(axes, "text", { x: -(top + height - bottom) / 2, y: 13, "text-anchor": "middle", transform: "rotate(-90)" }, yTitle);
+  for (const group of new Set(points.map((point) => point.group))) {
+    const members = points.filter((point) => point.group === group).sort((a, b) => a.x - b.x);
+    const mark = element(svg, "g", { class: `group${(group + 1) % 6}` });
+    element(mark, "path", { d: `M${members.map((point) => `${x(point.x)} ${y(point.y)}`).join("L")}` });
+    for (const point of members) {
+      const spot = element(mark, "circle", { cx: x(point.x), cy: y(point.y), r: point.key === selected ? 9 : 6, "data-key": point.key });
+      element(spot, "title", {}, point.title);
+      spot.addEventListener("click", () => onSelect(point.key));
+    }
   }
-  element(axes, "text", { x: (left + width - right) / 2, y: height - 8, "text-anchor": "middle", class: "title" }, xTitle);
-  element(axes, "text", { x: -(top + height - bottom) / 2, y: 13, "text-anchor": "middle", class: "title", transform: "rotate(-90)" }, yTitle);
-  if (Number.isFinite(threshold))
-    element(axes, "line", { x1: left, x2: width - right, y1: y(threshold), y2: y(threshold), class: "threshold" });
-  const line = front.map((index) => `${x(points[index].x)} ${y(points[index].y)}`);
-  if (line.length > 1) element(axes, "path", { d: `M${line.join("L")}`, class: "front" });
-  const order = [...points.keys()].sort((a, b) => points[a].x - points[b].x || points[a].y - points[b].y);
-  const behindFirst = [...order].sort((a, b) => front.includes(a) - front.includes(b) || (a === selected) - (b === selected));
-  for (const index of behindFirst) {
-    const point = points[index], onFront = front.includes(index);
-    const classes = ["point", `group${point.group % 6}`, onFront ? "on-front" : "", index === selected ? "selected" : ""];
-    const mark = element(svg, "g", {
-      class: classes.join(" ").trim(),
-      role: "option",
-      tabindex: index === selected ? 0 : -1,
-      "aria-selected": index === selected,
-      "aria-label": point.title,
-      "data-key": point.key,
-      transform: `translate(${x(point.x)} ${y(point.y)})`,
-    });
-    if (point.low !== null)
-      element(mark, "line", { x1: x(point.low) - x(point.x), x2: x(point.high) - x(point.x), y1: 0, y2: 0, class: "spread" });
-    element(mark, "circle", { r: 16, class: "target" });
-    if (index === marked) element(mark, "circle", { r: 11, class: "ring" });
-    element(mark, "path", { d: SHAPES[point.group % SHAPES.length](index === selected ? 7 : onFront ? 5.5 : 4.5), class: "shape" });
-    const show = () => onPoint(index, x(point.x), y(point.y));
-    mark.addEventListener("click", () => {
-      onSelect(index);
-      show();
-    });
-    mark.addEventListener("pointermove", (event) => {
-      if (event.movementX || event.movementY) show(); // else only the chart has changed below a pointer at rest
-    });
-    mark.addEventListener("pointerleave", () => onPoint(null));
-    mark.addEventListener("focus", show);
-    mark.addEventListener("blur", () => onPoint(null));
-  }
-  svg.onkeydown = (event) => {
-    const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
-    const place = order.indexOf(selected);
-    let next = null;
-    if (step) next = order[Math.min(Math.max(place + step, 0), order.length - 1)];
-    if (event.key === "Home") next = order[0];
-    if (event.key === "End") next = order[order.length - 1];
-    if (next === null) return;
-    event.preventDefault();
-    onSelect(next);
-    svg.querySelector("[tabindex='0']").focus();
-  };
 }

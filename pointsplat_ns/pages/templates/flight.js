@@ -217,7 +217,7 @@ class Flight {
     const last = this.times.at(-1) ?? now;
     if (this.controls.step(Math.min(0.1, (now - last) / 1000))) this.change();
     this.paint();
-    if (!this.settling || !this.drawer.gl) return;
+    if (!this.settling) return;
     this.times = [...this.times, now].slice(-30);
     const [first, frames] = [this.times[0], this.times.length - 1];
     if (frames < 4) return;
@@ -231,6 +231,6 @@ class Flight {
 
   paint() {
     const [left, right] = this.scenes, parts = right ? [[left, 0, this.wipe], [right, this.wipe, 1]] : [[left, 0, 1]];
-    if (left) this.drawer.draw(this.camera, this.data, parts, this.settling ? this.detail : 1, Boolean(this.settling));
+    if (left) this.drawer.draw(this.camera, this.data, parts, this.settling ? this.detail : 1);
   }
 }

@@ -1,20 +1,9 @@
-// The stage of the viewer: pointsplat view gives it scenes, at the share of the Gaussians that a slider says, and draws
-// pictures of them for browsers that cannot.
+// The stage of the viewer: pointsplat view gives it scenes, at the share of the Gaussians that a slider says.
 
+const DAMAGED = "The scene came damaged";
 const REST = 600; // milliseconds until a share counts as chosen: then its Gaussians are merged
-const QUICK = 360; // pixels of the longer side of a picture while the camera moves
 
 class Live extends Flight {
-  start() {
-    let why;
-    try {
-      if (location.search !== "?pictures") return super.start();
-    } catch (error) {
-      why = error;
-    }
-    this.drawer = new Pictures(this.canvas, why, (values) => this.picture(values));
-  }
-
   async load() {
     this.kept = [...this.data.kept];
     this.changes = this.kept.map(() => 0); // of each slider
@@ -25,15 +14,11 @@ class Live extends Flight {
     for (let index = 0; index < this.kept.length; index++) {
       this.say(`Loading ${this.data.scenes[index].name} …`);
       const { state, spz } = await this.ask(index, "");
-      this.whole.push(await this.made(spz));
+      this.whole.push(await this.unpacked(spz, DAMAGED));
       this.describe(index, state);
     }
     this.shown = [...this.whole];
     this.scenes = [...this.whole];
-  }
-
-  made(spz) {
-    return this.drawer.gl ? this.unpacked(spz, "The scene came damaged") : { sorting: { sort() {}, end() {} } };
   }
 
   listen() {
@@ -56,7 +41,7 @@ class Live extends Flight {
         if (!isNewest()) return;
         const { state, spz } = await this.ask(index, have);
         if (have !== state.how) {
-          const scene = percent === 100 ? this.whole[index] : await this.made(spz);
+          const scene = percent === 100 ? this.whole[index] : await this.unpacked(spz, DAMAGED);
           if (isNewest()) this.put(index, scene);
           else this.leave(index, scene);
         }
@@ -99,62 +84,16 @@ class Live extends Flight {
     code.hidden = !command;
   }
 
-  setWipe(share) {
-    super.setWipe(share);
-    if (!this.drawer.gl) this.change(); // quick pictures while it moves
-  }
-
   get still() {
-    return super.still && !this.asking && !this.drawer.asked;
+    return super.still && !this.asking;
   }
 
   async ask(index, have) {
     const percent = this.kept[index], isHere = percent === 100 && this.whole[index];
-    const answer = await this.post("/scene", { scene: index, percent, have, spz: Boolean(this.drawer.gl && !isHere) });
-    return { state: JSON.parse(answer.headers.get("X-State")), spz: new Uint8Array(await answer.arrayBuffer()) };
-  }
-
-  // A picture of what the camera sees; null if there is none.
-  async picture(values) {
-    try {
-      const answer = await this.post("/picture", { ...values, wipe: this.wipe, kept: this.kept });
-      this.say("");
-      return await createImageBitmap(await answer.blob());
-    } catch (error) {
-      this.say(error.message);
-      return null;
-    }
-  }
-
-  async post(path, values) {
-    const body = JSON.stringify({ ...values, stage: this.data.stage });
-    const answer = await fetch(path, { method: "POST", body }).catch(() => ({ ok: false }));
+    const body = JSON.stringify({ stage: this.data.stage, scene: index, percent, have, spz: !isHere });
+    const answer = await fetch("/scene", { method: "POST", body }).catch(() => ({ ok: false }));
     if (answer.status === 409) location.reload(); // another scene is shown by now
     if (!answer.ok) throw new Error("The viewer does not answer. Has pointsplat view ended?");
-    return answer;
-  }
-}
-
-// Draws as Drawer does, with pictures that it asks for, one after the other: small ones while the camera moves.
-class Pictures {
-  // Throws the error that says why there is no WebGL if nothing can be shown.
-  constructor(canvas, why, ask) {
-    this.context = canvas.getContext("2d", { alpha: false });
-    if (!this.context) throw why;
-    this.ask = ask;
-  }
-
-  remove() {}
-
-  async draw(camera, style, parts, detail, moving) {
-    const { canvas } = this.context, factor = moving ? Math.min(1, QUICK / Math.max(canvas.width, canvas.height)) : 1;
-    const [width, height] = [canvas.width, canvas.height].map((side) => Math.round(side * factor));
-    this.wanted = { camera: camera.state, width, height, quick: moving };
-    if (this.asked) return;
-    while ((this.asked = this.wanted)) {
-      this.wanted = null;
-      const picture = await this.ask(this.asked);
-      if (picture) this.context.drawImage(picture, 0, 0, canvas.width, canvas.height);
-    }
+    return { state: JSON.parse(answer.headers.get("X-State")), spz: new Uint8Array(await answer.arrayBuffer()) };
   }
 }
