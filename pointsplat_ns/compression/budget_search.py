@@ -35,31 +35,30 @@ def find_count(
     at_least: bool,
     first: int,
     most: int,
-    slope: float | None = None,
-    tolerance: float = 0.0,
+    slope: float,
+    tolerance: float,
     tries: float = math.inf,
 ) -> int | None:
-    """Search for the smallest count whose measure reaches the target, or the largest whose measure does not exceed it;
-    None if none does. The next count that was tried is at most 5 % away, or the measure within the tolerance.
+    """Search for nearly the smallest count whose measure reaches the target, or nearly the largest whose measure does
+    not exceed it: the best one tried; None if all counts miss it.
 
     Args:
         measure: from a count to a number that rises with it. It is called once for each count tried.
         target: the number to reach, or not to exceed.
         at_least: whether the measure has to reach the target; if not, it must not exceed it.
         first: the first count tried.
-        most: bound of the count.
-        slope: rise of the measure for each e-fold of the count; None if it is not known.
-        tolerance: distance from the target at which a count that meets it is good enough.
+        most: largest count.
+        slope: usual rise of the measure for each e-fold of the count.
+        tolerance: distance from the target at which a count that meets it is good enough. So is one within 5 % of a
+            count that misses it.
         tries: largest number of counts tried, once one has met the target.
 
     Example:
-        >>> find_count(lambda count: count / 10, 42.0, at_least=True, first=1000, most=1000) in range(420, 442)
+        >>> found = find_count(lambda count: count / 10, 42.0, True, first=1000, most=1000, slope=42.0, tolerance=1.0)
+        >>> found in range(420, 442)
         True
     """
     aimed = target + (0.5 if at_least else -0.5) * tolerance
-    # Without a tolerance, interpolated counts move by a share of the interval to the side that meets the target, so
-    # that the last count tried is likely to meet it; and extrapolated steps go further, so that two counts enclose it.
-    margin, overshoot = (0.0, 1.0) if tolerance else (0.03 if at_least else -0.03, 1.05)
     low, high = 0, most + 1  # counts below the target, and at or above it; out of bounds until measured
     values: dict[int, float] = {}
     best: int | None = None
@@ -70,57 +69,40 @@ def find_count(
         low, high = (count, high) if below else (low, count)
         if below != at_least:
             best = count
-        slope = _slope(values, target, slope)
+        good_enough = best == count and abs(value - target) <= tolerance
         close = best is not None and high <= max(low, 1) * 1.05
-        good_enough = best == count and 0 < tolerance >= abs(value - target)
-        if close or good_enough or high - low <= 1 or (best is not None and len(values) >= tries):
+        if good_enough or close or high - low <= 1 or (best is not None and len(values) >= tries):
             return best
-        if low in values and high in values:
-            guess = _interpolated(low, high, values[low], values[high], aimed, margin)
-        else:
-            tried = low if low in values else high
-            guess = _extrapolated(tried, aimed - values[tried], slope, tried == low, overshoot)
-        if guess * 1.05 > most and most not in values:
+        guess = _guess(values, aimed, slope)
+        if low in values and high in values:  # apart from both, so that each try narrows the interval
+            guess = min(low * (high / low) ** 0.85, max(low * (high / low) ** 0.15, guess))
+        elif guess * 1.05 > most and most not in values:
             guess = most
         count = min(high - 1, max(low + 1, round(guess)))
 
 
 def find_size(bytes_of: Callable[[int], float], limit: float, first: int, most: int) -> int | None:
     """Search for nearly the largest count, at most ``most``, whose file has at most ``limit`` bytes; None if there is
-    none. Each try makes a scene, so tries are few, and 95 % of the limit are good enough. Other arguments as for
-    :func:`find_count`."""
+    none. Each try makes a scene, so tries are few, and 95 % of the limit are good enough."""
 
     def measure(count: int) -> float:
         return math.log(bytes_of(count))
 
-    target, tolerance = math.log(max(limit, 1)), -math.log(0.95)
-    return find_count(measure, target, False, first, most, slope=1.0, tolerance=tolerance, tries=4)
+    return find_count(measure, math.log(max(limit, 1)), False, first, most, 1.0, -math.log(0.95), tries=4)
 
 
-def _interpolated(low: int, high: int, below: float, above: float, aimed: float, margin: float) -> float:
-    """The count where the line through two measured counts reaches ``aimed``, moved by a margin, and apart from both,
-    so that each try narrows the interval."""
-    share = (aimed - below) / (above - below) + margin if math.isfinite(above - below) and above > below else 0.5
-    return low * (high / low) ** min(0.85, max(0.15, share))
-
-
-def _extrapolated(tried: int, gap: float, slope: float | None, up: bool, overshoot: float) -> float:
-    """The count where the line through one measured count closes the gap to the target, at most 16 times as far."""
-    if slope is None or not math.isfinite(gap):
-        return tried * (2.0 if up else 0.25)
-    factor = overshoot * math.exp(min(abs(gap) / slope, math.log(16.0)))
-    return tried * factor if up else tried / factor
-
-
-def _slope(values: dict[int, float], target: float, known: float | None) -> float | None:
-    """Rise for each e-fold between the two measured counts nearest to the target; None if it is not positive. With
-    fewer than two counts, the known slope."""
-    nearest = sorted((count for count in values if math.isfinite(values[count])), key=lambda n: abs(values[n] - target))
-    if len(nearest) < 2:
-        return known
-    fewer, more = sorted(nearest[:2])
-    slope = (values[more] - values[fewer]) / math.log(more / fewer)
-    return slope if slope > 0 else None
+def _guess(values: dict[int, float], aimed: float, slope: float) -> float:
+    """The count where the line through the two measured counts nearest to ``aimed`` reaches it; with one count, or if
+    the measure falls between them, a line of the usual slope. It is at most 16 times as far as the nearest."""
+    nearest = sorted((count for count in values if math.isfinite(values[count])), key=lambda n: abs(values[n] - aimed))
+    if not nearest:
+        return min(values) / 4
+    if len(nearest) > 1:
+        fewer, more = sorted(nearest[:2])
+        found = (values[more] - values[fewer]) / math.log(more / fewer)
+        slope = found if found > 0 else slope
+    step = (aimed - values[nearest[0]]) / slope
+    return nearest[0] * math.exp(min(max(step, -math.log(16.0)), math.log(16.0)))
 
 
 def share_done(tries: float) -> float:
