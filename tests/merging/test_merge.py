@@ -153,9 +153,9 @@ def test_many_gaussians_at_one_place_are_merged_in_few_rounds():
 
 def test_a_merger_gives_what_merging_alone_gives_in_any_order_of_counts():
     faint = wall(8, seed=1).replace(opacities=torch.full((64, 1), -9.0))
-    scene = Gaussians.cat([wall(), wall()[:50], faint])  # the 50 are copies
+    scene = Gaussians.cat([wall(), faint])
     merger = Merger(scene, settings=RENDERED)
-    for k in (400, 90, 1000, 399, 1, 1620, 1660, len(scene)):
+    for k in (400, 90, 1000, 399, 1, 1640, len(scene)):
         merged, alone = merger.merged(k), merge(scene, k, settings=RENDERED)
         assert same(merged.scene, alone.scene) and torch.equal(merged.assignment, alone.assignment)
     for k in (0, len(scene) + 1):
