@@ -246,18 +246,3 @@ def _by_kernels(piece: Piece, group: Tensor, near: Tensor, fits: Fits) -> Tensor
     )  # fmt: skip
     on_threads(len(group) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
     return best
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernel chooses the groups of some members as torch does."""
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **DOUBLES)
-
-    piece = Piece(random(90, 3), random(90, 6), random(90, 3).float())
-    fits = Fits(random(9, 3), random(9, 6), random(9), random(9, 3), 2.0)
-    group, near = (torch.randint(9, shape, generator=generator, device="cpu") for shape in ((90,), (90, 4)))
-    torchs = fits.best_of(piece, torch.cat([group[:, None], near], dim=1))
-    return torch.equal(_by_kernels(piece, group, near.int(), fits), torchs)
