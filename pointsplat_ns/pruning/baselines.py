@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, log_volume, opacity, weighted_score
+from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, weighted_score
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -29,20 +28,9 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
     )
 
 
-def log_volume_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """Eq. 3 with the logarithm of the volume in place of the volume, so that a few giants do not dominate the z-score.
-    Errors as of :func:`~pointsplat_ns.pruning.paper.paper_score`."""
-    return weighted_score(scene, opacity_weight, opacity, lambda part: _within_finite(log_volume(part)))
-
-
 def opacity_score(scene: Gaussians) -> Tensor:
     """Opacity alone: the logit, which ranks like alpha but does not saturate, (N,) float64."""
     return _only_usable(scene, scene.opacities[:, 0].double())
-
-
-def volume_score(scene: Gaussians) -> Tensor:
-    """Volume alone: its logarithm, which ranks like the volume but does not overflow, (N,) float64."""
-    return _only_usable(scene, log_volume(scene))
 
 
 def log_area(scene: Gaussians) -> Tensor:
@@ -50,11 +38,6 @@ def log_area(scene: Gaussians) -> Tensor:
     a factor, this is the area seen from the broad side."""
     scales = scene.scales.double()
     return scales.sum(dim=1) - scales.amin(dim=1) if bool(scales.isfinite().all()) else scales.topk(2).values.sum(1)
-
-
-def area_score(scene: Gaussians) -> Tensor:
-    """Opacity times area: log(alpha * product of the two largest standard deviations), (N,) float64."""
-    return _only_usable(scene, F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene))
 
 
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:

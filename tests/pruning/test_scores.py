@@ -30,10 +30,7 @@ def exactly(scene):
 FORMULAS = {
     "paper": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
     "authors": lambda w, alpha, s, logit, log_s: w * z(logit) + (1 - w) * z((log_s + np.longdouble(1e-6)).prod(1)),
-    "log-volume": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.log(s.prod(1))),
     "opacity": lambda w, alpha, s, logit, *_: logit,
-    "volume": lambda w, alpha, s, *_: np.log(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
-    "area": lambda w, alpha, s, *_: np.log(alpha * np.sort(s, 1)[:, 1:].prod(1)),
 }
 """Scores as printed, from a weight of opacity and what :func:`exactly` gives."""
 
@@ -107,7 +104,7 @@ def test_no_score_of_what_can_be_drawn_is_nan(name, case):
     assert len(prune(scene, 7, name)) == 7
 
 
-@pytest.mark.parametrize("name", ["paper", "authors", "opacity", "area", "log-volume"])
+@pytest.mark.parametrize("name", ["paper", "authors", "opacity"])
 def test_infinite_logits_keep_their_rank(name):
     scene = normal_scene(9, 1)
     logits = torch.linspace(-3, 3, 9)[:, None]
@@ -197,6 +194,6 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     scene = scene_at(torch.cat([big, small]), scales, logits)
     cell = (scene.means[:, 0] > 0.5) * 16 + (scene.means[:, 1] * 4).long().clamp_max(3) * 4
     cell = cell + (scene.means[:, 2] * 4).long().clamp_max(3)
-    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
+    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper")}
     regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
-    assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20
+    assert regions["coverage"] == 32 and regions["paper"] < 20
