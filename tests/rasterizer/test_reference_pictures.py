@@ -1,12 +1,11 @@
-"""Recorded pictures, and drawing a scene."""
+"""Pictures of small scenes by every path, and drawing a scene."""
 
 import dataclasses
-import re
 
 import pytest
 import torch
 
-import golden
+import reference_pictures as pictures
 from making import box_room, views_from_within
 from pointsplat_ns.rasterizer import pixels_of, projection
 from pointsplat_ns.rasterizer import scene as scene_module
@@ -28,30 +27,15 @@ if torch.cuda.is_available():
     PATHS["CUDA"] = {"device": "cuda"}
 
 
-@pytest.fixture(scope="module")
-def stored():
-    return golden.stored()
-
-
-def test_a_changed_file_has_a_written_reason():
-    entries = re.findall(r"^- `([0-9a-f]{64})`\n  (.+)$", golden.REASONS.read_text("utf-8"), flags=re.MULTILINE)
-    assert entries and entries[-1][0] == golden.digest(), "make it by tests/support/golden.py, which asks for a reason"
-    assert all(len(reason) >= 20 for _, reason in entries)
-    assert golden.GOLDEN.stat().st_size < 200_000
-
-
-@pytest.mark.parametrize("name", golden.SCENES)
-def test_the_reference_is_what_it_was(name, stored):
-    drawn = golden.drawn_by_reference(golden.SCENES[name], stored[name])
-    golden.compare(drawn, stored[name], golden.STORED, golden.STORED)
-
-
 @pytest.mark.parametrize("options", PATHS.values(), ids=PATHS)
-@pytest.mark.parametrize("dtype", golden.TOLERANCES)
-@pytest.mark.parametrize("name", golden.SCENES)
-def test_the_fast_path_draws_the_stored_images(name, dtype, options, stored):
-    drawn = golden.drawn(golden.SCENES[name], stored[name], dtype, **options)
-    golden.compare(drawn, stored[name], *golden.TOLERANCES[dtype])
+@pytest.mark.parametrize("dtype", pictures.TOLERANCES)
+@pytest.mark.parametrize("name", pictures.SCENES)
+def test_every_path_draws_what_the_reference_draws(name, dtype, options):
+    pictures.compare(
+        pictures.drawn(name, dtype, **options),
+        pictures.drawn_by_reference(name),
+        *pictures.TOLERANCES[dtype],
+    )
 
 
 @pytest.fixture(scope="module")

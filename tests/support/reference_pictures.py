@@ -1,0 +1,165 @@
+"""Small scenes with all that pictures depend on, drawn by the float64 reference and by the fast path."""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lab.numerics.reference import rasterize_reference
+from pointsplat_ns.rasterizer import rasterization
+
+WIDTH, HEIGHT = 26, 18  # twelve tiles, some of them cut off: compiled kernels are used from eight on
+COUNT = 16
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+TOLERANCES = {torch.float32: (1e-5, 1e-4), torch.float64: (1e-9, 1e-8)}
+"""Of the largest value of an image, and of a gradient's norm. For float32 ten times what was seen: an image is rounded
+by some tens of layers, and a gradient is a sum over pixels that partly cancel. For float64 it is another order."""
+
+
+@dataclass(frozen=True)
+class Small:
+    """What a scene is like and how it is drawn."""
+
+    seed: int
+    sh_degree: int | None = 3
+    channels: int = 3
+    mode: str = "classic"
+    render_mode: str = "RGB"
+    background: tuple[float, ...] | None = None
+    principal: tuple[float, float] = (13.5, 8.4)
+    focal: tuple[float, float] = (24.0, 25.0)
+    change: Callable[[dict[str, Tensor]], None] = field(default=lambda scene: None)
+
+
+def _needles(scene: dict[str, Tensor]) -> None:
+    scene["scales"][:, 0], scene["scales"][:, 1:] = 2.0, 1e-3
+
+
+def _opaque(scene: dict[str, Tensor]) -> None:
+    scene["opacities"][:] = 1.0
+    scene["scales"] *= 2.5
+
+
+def _below_a_pixel(scene: dict[str, Tensor]) -> None:
+    scene["scales"] *= 0.1
+    scene["opacities"][:] = 1.0
+
+
+def _large_and_faint(scene: dict[str, Tensor]) -> None:
+    scene["scales"] *= 8
+    scene["opacities"] *= 0.3
+
+
+def _around_the_camera(scene: dict[str, Tensor]) -> None:
+    scene["means"][::2, 2] -= 2.9  # some behind it, some before the near plane, some beside the field of view
+    scene["scales"] *= 0.5
+
+
+SCENES = {
+    "colours": Small(0, sh_degree=None),
+    "degree 0 over a background": Small(1, sh_degree=0, background=(0.9, 0.5, 0.1)),
+    "degree 1": Small(2, sh_degree=1),
+    "degree 2 with depth": Small(3, sh_degree=2, render_mode="RGB+D"),
+    "degree 3 with expected depth": Small(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
+    "seven channels": Small(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
+    "antialiased": Small(6, mode="antialiased"),
+    "antialiased below a pixel": Small(7, mode="antialiased", change=_below_a_pixel),
+    "needles": Small(8, sh_degree=1, change=_needles),
+    "opaque": Small(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
+    "large and faint": Small(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
+    "around the camera": Small(
+        11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera
+    ),
+}
+
+
+@functools.cache
+def made(name: str) -> dict[str, Tensor]:
+    """The tensors of one of :data:`SCENES`, in numbers that float32 holds."""
+    small = SCENES[name]
+    random = np.random.RandomState(small.seed)  # whose numbers never change
+
+    def normal(*shape: int) -> Tensor:
+        return torch.from_numpy(random.standard_normal(shape))
+
+    depth = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    coefficients = (0 if small.sh_degree is None else small.sh_degree) + 1
+    colors = torch.rand(0) if small.sh_degree is None else 0.3 * normal(COUNT, coefficients**2, 3)
+    if small.sh_degree is None:
+        colors = torch.from_numpy(random.uniform(size=(COUNT, small.channels)))
+    scene = {
+        "means": normal(COUNT, 3) * torch.tensor([0.9, 0.6, 0.5], dtype=torch.float64) + depth,
+        "quats": normal(COUNT, 4),
+        "scales": torch.exp(0.6 * normal(COUNT, 3) - 1.6),
+        "opacities": torch.from_numpy(random.uniform(0.2, 0.98, COUNT)),
+        "colors": colors,
+    }
+    small.change(scene)
+    angle = 0.15
+    view = torch.eye(4, dtype=torch.float64)
+    view[0, 0] = view[2, 2] = math.cos(angle)
+    view[0, 2], view[2, 0] = math.sin(angle), -math.sin(angle)
+    view[:3, 3] = torch.tensor([-0.4, 0.05, 0.1], dtype=torch.float64)
+    K = torch.eye(3, dtype=torch.float64)
+    K[0, 0], K[1, 1] = small.focal
+    K[0, 2], K[1, 2] = small.principal
+    return {name: value.float().double() for name, value in {**scene, "viewmat": view, "K": K}.items()}
+
+
+def total(renders: Tensor, alphas: Tensor) -> Tensor:
+    """A sum over the image whose gradients are kept; neither symmetric nor of one sign."""
+    both = torch.cat([renders, alphas], dim=-1)
+    weights = torch.cos(torch.arange(both.numel(), dtype=torch.float64)).view(both.shape)
+    return (both * weights.to(both)).sum()
+
+
+@functools.cache
+def drawn_by_reference(name: str) -> dict[str, Tensor]:
+    """Of one of :data:`SCENES` image (H, W, channels), alphas (H, W, 1) and gradients of :func:`total`, float64."""
+    small, scene = SCENES[name], made(name)
+    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+    image, alphas, depths = rasterize_reference(
+        *leaves.values(), scene["viewmat"], scene["K"], WIDTH, HEIGHT,
+        sh_degree=small.sh_degree, antialiased=small.mode == "antialiased",
+    )  # fmt: skip
+    if small.background is not None:
+        image = image + (1 - alphas) * torch.tensor(small.background, dtype=torch.float64)
+    if small.render_mode == "RGB+D":
+        image = torch.cat([image, depths], dim=-1)
+    if small.render_mode == "RGB+ED":
+        image = torch.cat([image, depths / alphas.clamp_min(1e-10)], dim=-1)
+    grads = torch.autograd.grad(total(image, alphas), list(leaves.values()), materialize_grads=True)
+    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
+    return {"image": image.detach(), "alphas": alphas.detach(), **of_names}
+
+
+def drawn(name: str, dtype: torch.dtype, device: torch.device | str = "cpu", **options) -> dict[str, Tensor]:
+    """As :func:`drawn_by_reference`, by the fast path in some precision on a device; ``options`` are those of
+    :func:`pointsplat_ns.rasterization`."""
+    small, scene = SCENES[name], made(name)
+    leaves = {name: scene[name].to(device, dtype, copy=True).requires_grad_() for name in NAMES}
+    background = None if small.background is None else torch.tensor([small.background], device=device, dtype=dtype)
+    renders, alphas, _ = rasterization(
+        *leaves.values(), scene["viewmat"][None].to(leaves["means"]), scene["K"][None].to(leaves["means"]),
+        WIDTH, HEIGHT, sh_degree=small.sh_degree, backgrounds=background, render_mode=small.render_mode,
+        rasterize_mode=small.mode, **options,
+    )  # fmt: skip
+    grads = torch.autograd.grad(total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
+    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
+    found = {"image": renders[0], "alphas": alphas[0], **of_names}
+    return {name: value.detach().to("cpu", torch.float64) for name, value in found.items()}
+
+
+def compare(found: dict[str, Tensor], wanted: dict[str, Tensor], image: float, gradient: float) -> None:
+    """Raise AssertionError unless images agree to a share of the largest value, and gradients of their norm."""
+    for name in ("image", "alphas"):
+        off = (found[name] - wanted[name]).abs().max() / wanted[name].abs().max()
+        assert off <= image, (name, float(off))
+    for name in (f"grad of {part}" for part in NAMES):
+        off = (found[name] - wanted[name]).norm() / wanted[name].norm()
+        assert off <= gradient, (name, float(off))
