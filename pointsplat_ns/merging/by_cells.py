@@ -37,9 +37,10 @@ from pointsplat_ns.merging.matching import candidate_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.replacement import Round, replace_pairs
-from pointsplat_ns.merging.rounds import merge, most_pairs, views_and_weights
+from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import ColourAxes, Participants, State, drawable, initial_state, principal_axes
+from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each

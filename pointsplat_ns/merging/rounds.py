@@ -29,7 +29,7 @@ from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
-from pointsplat_ns.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
+from pointsplat_ns.merging.visibility import Viewpoints, views_and_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
@@ -199,19 +199,6 @@ class Step:
     rounds: tuple[Round, ...]
     reference: RendersOfSizes | None
     """Renders of the scene, or of what remained once it was few enough to render."""
-
-
-def views_and_weights(
-    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
-) -> tuple[Viewpoints | None, Tensor]:
-    """The viewpoints, None for a small scene without known views, and the visibility weights (n,) of participants;
-    ``views`` as for :func:`merge`."""
-    viewpoints: Viewpoints | None = None
-    if isinstance(views, Views):
-        viewpoints = Viewpoints(views)
-    elif len(participants) >= settings.min_count_rendered:
-        viewpoints = sampled_viewpoints(views or Sampler(participants.scene), settings)
-    return viewpoints, visibility_weights(participants, viewpoints, settings)
 
 
 def first_step(scene: Gaussians, k: int, views: Views | Sampler | None, settings: MergeSettings, last: int = 0) -> Step:

@@ -13,6 +13,7 @@ Where traces in the scene show where its photos were taken, the weight is multip
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,39 @@ from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoints:
+    """Views that visibility is computed in."""
+
+    views: Views  # in scene units
+    photos_found: bool = False
+    """Whether views were sampled about where photos were taken, which traces in the scene show."""
+
+
+def views_and_weights(
+    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
+) -> tuple[Viewpoints | None, Tensor]:
+    """The viewpoints, and the visibility weights (n,) of participants.
+
+    Args:
+        participants: n Gaussians.
+        views: known views, or the sampler of those that people may have taken, by default a new one.
+        settings: ``min_count_rendered``, ``sampled_views``, ``view_seed`` and those of the weights.
+
+    Returns:
+        No viewpoints for a small scene without known views, if nothing is visible, or if no view is asked for.
+    """
+    viewpoints: Viewpoints | None = None
+    if isinstance(views, Views):
+        viewpoints = Viewpoints(views)
+    elif len(participants) >= settings.min_count_rendered:
+        sampler = views or Sampler(participants.scene)
+        with contextlib.suppress(DataError):
+            found = sampler.views(settings.sampled_views, settings.view_seed)
+            viewpoints = Viewpoints(found, sampler.photos is not None)
+    return viewpoints, visibility_weights(participants, viewpoints, settings)
 
 
 def visibility_weights(participants: Participants, viewpoints: Viewpoints | None, settings: MergeSettings) -> Tensor:
@@ -70,28 +104,3 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     if not 0 < float(well_seen) < math.inf:
         return torch.ones(len(ratios), **FLOATS)
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoints:
-    """Views that visibility is computed in."""
-
-    views: Views  # in scene units
-    photos_found: bool = False
-    """Whether views were sampled about where photos were taken, which traces in the scene show."""
-
-
-def sampled_viewpoints(sampler: Sampler, settings: MergeSettings) -> Viewpoints | None:
-    """Views that people may have taken, and whether traces in the scene show where.
-
-    Args:
-        sampler: of the scene.
-        settings: ``sampled_views`` and ``view_seed``.
-
-    Returns:
-        The viewpoints; None if nothing of the scene is visible, or no view is asked for.
-    """
-    try:
-        return Viewpoints(sampler.views(settings.sampled_views, settings.view_seed), sampler.photos is not None)
-    except DataError:
-        return None

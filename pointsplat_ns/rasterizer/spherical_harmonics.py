@@ -17,7 +17,7 @@ from pointsplat_ns.system.tensors import full_precision
 def check_degree(degree: int) -> None:
     """Raise a ValueError unless the degree is 0 to 3."""
     if not 0 <= degree <= 3:
-        raise ValueError(f"SH degree is {degree}; expected 0 to 3")
+        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
@@ -104,7 +104,7 @@ def sh_to_color(
     directions: Tensor,
     coefficients: Tensor | tuple[Tensor, Tensor],
     degree: int,
-    ids: Tensor | None = None,
+    ids: Tensor,
     compiled: bool | None = None,
 ) -> Tensor:
     """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
@@ -112,8 +112,8 @@ def sh_to_color(
     Args:
         directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
             the basis at zero.
-        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored. Or the first of
-            each and the others, (N, 3) and (N, K - 1, 3): the kernels then bring nothing together.
+        coefficients: (N, K, 3); K >= (degree + 1)^2, the rest is ignored. Or the first of each and the others, (N, 3)
+            and (N, K - 1, 3): the kernels then bring nothing together.
         degree: 0 to 3.
         ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
@@ -129,8 +129,6 @@ def sh_to_color(
     used, stored = (degree + 1) ** 2, first.shape[-2] if rest is None else 1 + rest.shape[-2]
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
-    if ids is None:
-        ids = torch.arange(first.shape[0], device=first.device, dtype=torch.int64)
     if KERNELS.usable_for(compiled, directions, first, *([] if rest is None else [rest])):
         # a constant has no direction
         return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)

@@ -18,7 +18,7 @@ from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.merging.visibility import (
     Viewpoints,
     covered_per_area,
-    sampled_viewpoints,
+    views_and_weights,
     visibility_weights,
 )
 from pointsplat_ns.views import Views
@@ -114,16 +114,13 @@ def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_pho
     assert found.tolist() == [8.0 if found_photos else 0.5] * 30
 
 
-def test_without_a_free_place_there_are_no_viewpoints():
-    fog = ball(200)
-    fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
-    assert sampled_viewpoints(Sampler(fog, (32, 24)), MERGING) is None
-
-
-def test_sampled_viewpoints_say_whether_photo_places_are_sure():
-    settings = replace(MERGING, sampled_views=2)
-    for scene, found in ((photographed(), True), (ball(500, 0), False)):
-        assert sampled_viewpoints(Sampler(scene, (32, 24)), settings).photos_found == found
+def test_sampled_viewpoints_say_whether_photo_places_are_sure_and_fog_has_none():
+    settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
+    fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
+    for scene, found in ((photographed(), True), (ball(500, 0), False), (fog, None)):
+        participants = Participants.of(scene, torch.arange(len(scene)))
+        viewpoints, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
+        assert (viewpoints and viewpoints.photos_found) == found and weights.shape == (len(scene),)
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_colours_and_their_gradients_are_gsplats(degree, stored):
     theirs = gsplat_formulas()
     if stored < (degree + 1) ** 2:
         with pytest.raises(ValueError, match=f"{stored} SH coefficients given"):
-            sh_to_color(torch.zeros(2, 3), torch.zeros(2, stored, 3), degree)
+            sh_to_color(torch.zeros(2, 3), torch.zeros(2, stored, 3), degree, torch.arange(2))
         return
     g = torch.Generator().manual_seed(degree)
     directions = (4 * torch.randn(5000, 3, generator=g, dtype=F64)).requires_grad_()
