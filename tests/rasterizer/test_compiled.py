@@ -174,10 +174,3 @@ def test_pairs_are_those_of_torch(cameras):
         assert len(theirs.gaussians) > 0
         for name in ("gaussians", "offsets", "places", "counts", "order"):
             assert torch.equal(getattr(mine, name), getattr(theirs, name)), (region, name)
-
-
-@needs_compiler
-def test_no_gaussian_gives_no_pair():
-    empty = footprints(2, True, count=0)
-    tiles = empty.tiles(empty.whole)
-    assert len(tiles.gaussians) == len(tiles.counts) == 0 and not tiles.offsets.any()

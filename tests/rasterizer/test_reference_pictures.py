@@ -1,17 +1,14 @@
 """Pictures of small scenes by every path, and drawing a scene."""
 
-import dataclasses
-
 import pytest
 import torch
 
 import reference_pictures as pictures
 from making import box_room, views_from_within
-from pointsplat_ns.rasterizer import pixels_of, projection
+from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.rasterizer import scene as scene_module
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
 from pointsplat_ns.rasterizer.projection import project_scene
-from pretend_gpu import GPU, pretend_gpu
 
 TORCH = {"compiled": False}
 
@@ -46,22 +43,6 @@ def room():
 @pytest.fixture(scope="module")
 def views(room):
     return views_from_within((0.0, 0.0, 0.0), 2, 48, 36)
-
-
-def test_cameras_are_on_the_cpu_in_float64_for_any_scene_and_view(room, views, monkeypatch):
-    given = []
-
-    def recorded(centre_of):
-        return lambda viewmat: given.append(viewmat) or centre_of(viewmat)
-
-    monkeypatch.setattr(projection, "camera_centre", recorded(projection.camera_centre))
-    for dtype in (torch.float32, torch.float64):
-        view = dataclasses.replace(views[0], viewmat=views[0].viewmat.to(dtype), K=views[0].K.to(dtype))
-        with pretend_gpu():
-            project_scene(room[:20].to(GPU), view)
-            project_scene(room[:20].to(GPU), dataclasses.replace(view, viewmat=view.viewmat.to(GPU), K=view.K.to(GPU)))
-    assert len(given) == 4
-    assert all((viewmat.device.type, viewmat.dtype) == ("cpu", torch.float64) for viewmat in given)
 
 
 @pytest.mark.parametrize("compiled", [None, False])
