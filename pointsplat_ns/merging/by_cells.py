@@ -39,16 +39,21 @@ from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import ColourAxes, Participants, State, drawable, initial_state, principal_axes
+from pointsplat_ns.merging.state import (
+    OF_EACH,
+    ColourAxes,
+    Participants,
+    State,
+    drawable,
+    initial_state,
+    principal_axes,
+)
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.views import Views
-
-_OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
-"""Tensors of a state that have a row for each Gaussian."""
 
 
 @torch.no_grad()
@@ -203,7 +208,7 @@ class _Work:
             costs = pair_costs(state, near, self.settings)
             first, second, prices = candidate_pairs(near, costs, self.settings.matching_passes)
         pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
-        return {**{name: getattr(state, name) for name in _OF_EACH}, "group": group.int(), **pairs}
+        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
 
     def _state(self, number: int, cell: int) -> tuple[State, Tensor]:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
@@ -212,7 +217,7 @@ class _Work:
             return state, torch.arange(len(state), **INDICES)
         scratch = self.cells.scratch
         before = scratch.known(_round(number - 1, cell))
-        of_each = {name: before[name] for name in _OF_EACH}
+        of_each = {name: before[name] for name in OF_EACH}
         state = State(**of_each, centre=self.overview.centre, size=float(self.overview.size))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))

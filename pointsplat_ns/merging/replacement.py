@@ -31,7 +31,7 @@ from pointsplat_ns.merging.covariance import (
     thinnest_axes,
 )
 from pointsplat_ns.merging.settings import MergeSettings
-from pointsplat_ns.merging.state import State
+from pointsplat_ns.merging.state import OF_EACH, State
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 
 
@@ -58,8 +58,7 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     place = stays.cumsum(0) - 1
     place[second] = place[first]
     rows = stays.nonzero()[:, 0]
-    names = ("means", "cov", "alphas", "colours", "weights", "counts")
-    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in names})
+    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in OF_EACH})
     shares = torch.ones(len(state), **FLOATS)
     for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
         i, j = first[part], second[part]

@@ -22,10 +22,11 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
-from pointsplat_ns.merging.finishing import Finish, finished
+from pointsplat_ns.merging.finishing import Finish, best_finish
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
@@ -183,7 +184,15 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
     participants = step.participants
     with one_thread_each():
         groups = Groups.of(participants, step.state, step.rounds)
-        group, scene, finish = finished(participants, groups, step.reference, regroup, settings)
+        any_merged, reference, finish = groups.any_merged, step.reference, Finish()
+        if regroup and any_merged and settings.regrouping_rounds > 0:
+            groups = regrouped(participants, groups, settings)
+        give_back_freed_memory()
+        group, make = scene_maker(participants, groups, settings)
+        del groups
+        if reference is not None and any_merged:
+            finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))))
+        scene = make(finish.size_change)
     assignment = torch.full((len(participants.scene),), -1, **INDICES)
     assignment[participants.members] = group
     return Merged(scene.to(device), assignment.to(device), finish)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, weighted_score
+from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, of_usable, weighted_score
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -30,7 +30,7 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
 
 def opacity_score(scene: Gaussians) -> Tensor:
     """Opacity alone: the logit, which ranks like alpha but does not saturate, (N,) float64."""
-    return _only_usable(scene, scene.opacities[:, 0].double())
+    return of_usable(scene, lambda part: part.opacities[:, 0].double())
 
 
 def log_area(scene: Gaussians) -> Tensor:
@@ -43,10 +43,7 @@ def log_area(scene: Gaussians) -> Tensor:
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:
     """Uniform in [0, 1), the same for a seed on every device, (N,) float64."""
     generator = torch.Generator().manual_seed(seed)
-    return _only_usable(scene, torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device))
-
-
-def _only_usable(scene: Gaussians, scores: Tensor) -> Tensor:
+    scores = torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device)
     return torch.where(scene.usable(), scores, math.nan)
 
 
