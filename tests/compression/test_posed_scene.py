@@ -18,11 +18,10 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_named_views
-from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.upright import axis_named
 from pointsplat_ns.placing import run_frame
-from posing import inria, name_of, nerfstudio, write_colmap_text, written
+from posing import inria, nerfstudio, write_colmap_text, write_photos, written
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +101,6 @@ def turned_about(views: ps.Views) -> ps.Views:
     """Cameras in another frame, whose x, y and z are the scene's y, z and x."""
     turn = torch.eye(4, dtype=torch.float64)[[1, 2, 0, 3]]
     return replace(views, viewmats=views.viewmats.double() @ turn)
-
-
-def write_photos(scene: Gaussians, views: ps.Views, folder: Path) -> None:
-    folder.mkdir(parents=True)
-    for index, view in enumerate(views):
-        write_picture(ps.render(scene, view), folder / name_of(index))
 
 
 @pytest.mark.parametrize("layout", ["nerfstudio", "scannet++", "colmap"])

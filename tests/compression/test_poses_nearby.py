@@ -12,8 +12,7 @@ import pointsplat_ns as ps
 from making import ball, run_of
 from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.io.pictures import write_picture
-from posing import inria, name_of, nerfstudio, write_colmap_text
+from posing import inria, nerfstudio, write_colmap_text, write_photos
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +37,6 @@ def known(path: Path, poses: str | None = None) -> ps.Views | None:
 
 def same(found: ps.Views | None, views: ps.Views) -> bool:
     return found is not None and torch.allclose(found.viewmats, views.viewmats.double(), atol=1e-5)
-
-
-def write_photos(scene, views, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, view in enumerate(views):
-        write_picture(ps.render(scene, view), folder / name_of(index))
 
 
 @pytest.mark.parametrize("place", ["point_cloud/iteration_30000/point_cloud.ply", "room.ply"])
