@@ -96,21 +96,3 @@ def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
     run = run_of(trained_walls, "wall-a")
     assert read_source(run, Looking())[1].known(3) is not None
     assert read_source(run, Looking("none"))[1].known(3) is None
-
-
-def test_commands_of_a_sweep_of_sampled_views_say_so(trained_walls, tmp_path):
-    run = run_of(trained_walls, "wall-a")
-    options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
-    ps.measure_tradeoff(run, tmp_path / "out", poses="none", **options)
-    points = (tmp_path / "out" / "tradeoff.json").read_text()
-    assert f"pointsplat prune {run} " in points and "--poses none" in points and "sampled" in points
-
-
-def test_films_and_the_viewer_use_them_too(scene, views, tmp_path):
-    path = tmp_path / "room.ply"
-    ps.save(scene, path)
-    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
-    assert ps.render_path(path, tmp_path / "through", width=32, height=24) == len(views)
-    assert ps.render_path(path, tmp_path / "around", views="none", width=32, height=24, fps=10, seconds=0.3) == 3
-    with ps.open_viewer(path, port=0) as known, ps.open_viewer(path, views="none", port=0) as sampled:
-        assert known.origin == "given views" and sampled.origin != known.origin

@@ -60,12 +60,6 @@ def test_views_all_around_show_nearly_all_and_one_side_less():
     assert 0.05 < coverage(scene, one_side) < 0.75
 
 
-def test_a_scene_that_is_not_visible_has_coverage_zero():
-    scene = ball(50)
-    views = sample_views(scene, 2, 64, 48)
-    assert coverage(scene.replace(opacities=torch.full_like(scene.opacities, -30.0)), views) == 0.0
-
-
 K = torch.tensor([[[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]]])
 
 VIEWS = Views(torch.eye(4)[None], K, 100, 100, torch.zeros(3))

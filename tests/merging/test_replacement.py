@@ -81,18 +81,6 @@ def test_a_state_in_float32_becomes_what_one_in_float64_becomes(scene):
         assert float(apart.quantile(0.98)) < 1e-3  # areas of needles, of which float32 loses the width, are the others
 
 
-def test_any_number_of_threads_gives_the_same_and_others_stay_as_they_are():
-    state, pairs = state_of(cloud(9000)), torch.arange(6000).view(2, 3000)
-
-    def replaced() -> list[torch.Tensor]:
-        after, merged = replace_pairs(state, *pairs, MERGING)
-        return [*(value for value in vars(after).values() if isinstance(value, torch.Tensor)), *merged]
-
-    assert_same_on_any_threads(replaced)
-    after, _ = replace_pairs(state, *pairs, MERGING)
-    assert torch.equal(after.cov[3000:], state.cov[6000:]) and torch.equal(after.colours[3000:], state.colours[6000:])
-
-
 def ring(n: int) -> torch.Tensor:
     """(n, 2) int32: the one before and the one after each, around."""
     here = torch.arange(n)

@@ -142,18 +142,3 @@ def test_projections_and_gradients_are_those_of_torch(name):
     assert off(one.depth_keys, other.depth_keys)[0] <= 1e-6
     dropped = torch.ones(len(scene[0]), dtype=torch.bool).index_fill_(0, common, False)
     assert not any(grad[dropped].any() for grad in results[0][1][:4])
-
-
-@needs_compiler
-@pytest.mark.parametrize("count", [0, 1, 9, 60])
-def test_where_no_gaussian_is_seen_gradients_are_zero(count):
-    scene = scene_of(60)
-    scene[0][:, 2] = -scene[0][:, 2].abs() - 1
-    scene[:4] = [t[:count] for t in scene[:4]]
-    leaves, seen = projected(scene, {}, F32, True)
-    assert [tuple(t.shape) for t in vars(seen).values()] == [
-        (0,), (0, 2), (0,), (0, 3), (0,), (0,), (0, 3), (0,), (0,)
-    ]  # fmt: skip
-    assert (seen.ids.dtype, seen.radii.dtype, seen.depth_keys.dtype) == (torch.int64, torch.int32, F32)
-    grads = torch.autograd.grad(seen.means2d.sum() + seen.det.sum(), leaves)
-    assert [g.shape for g in grads] == [leaf.shape for leaf in leaves] and not any(g.any() for g in grads)

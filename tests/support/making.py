@@ -24,7 +24,6 @@ from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.views import Views
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LAB = REPOSITORY / "lab"
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
