@@ -38,8 +38,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.merging import MERGING
+from pointsplat_ns.merging.rounds import views_and_weights
 from pointsplat_ns.merging.state import Participants, drawable
-from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.threads import one_thread_each

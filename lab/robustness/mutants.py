@@ -64,7 +64,7 @@ _SAME_RESULT = "tests/test_same_result.py"
 PARTS = {
     "rasterizer": Part(
         ("pointsplat_ns/rasterizer/*.py",),
-        ("tests/rasterizer/test_reference_pictures.py", "tests/rasterizer/test_[ip]*.py"),
+        ("tests/rasterizer/test_golden.py", "tests/rasterizer/test_input.py", "tests/rasterizer/test_projection.py"),
         ("tests/rasterizer/test_*.py", "tests/pruning/test_view_scores.py", _SAME_RESULT),
         left_out=("constants.py",),
     ),

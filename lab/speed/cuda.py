@@ -2,7 +2,7 @@
 
     python -m lab.speed.cuda
 
-Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships: reference pictures,
+Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships: golden pictures,
 the room, and photos of a room that are made. It takes at most four minutes, and gsplat, if it is installed, as long as
 its kernels take to compile when first used, which is why it comes last.
 """
@@ -36,7 +36,7 @@ from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.backends import gsplat_works
 
 SUPPORT = Path(__file__).parents[2] / "tests" / "support"
-"""Where the reference pictures are made and compared."""
+"""Where the golden pictures are made and compared."""
 
 NEAR_DB = 0.1
 """Largest difference of PSNR between two devices, dB: a repair rounds in another way on each."""
@@ -54,18 +54,18 @@ def scenes_of(every: int) -> dict[str, ps.Gaussians]:
     return {"the room that ships": ps.example_room()[::every], "bare walls": scenes.room(20_000 // every)}
 
 
-def reference_pictures_agree(device: torch.device) -> str:
+def golden_pictures(device: torch.device) -> str:
     """Pictures and gradients of small scenes are those of the float64 reference, in both precisions."""
     sys.path.insert(0, str(SUPPORT))
-    import reference_pictures as pictures
+    import golden
 
-    for name in pictures.SCENES:
-        for dtype, tolerances in pictures.TOLERANCES.items():
+    for name in golden.SCENES:
+        for dtype, tolerances in golden.TOLERANCES.items():
             try:
-                pictures.compare(pictures.drawn(name, dtype, device), pictures.drawn_by_reference(name), *tolerances)
+                golden.compare(golden.drawn(name, dtype, device), golden.drawn_by_reference(name), *tolerances)
             except AssertionError as error:
                 raise AssertionError(f"{name}, {dtype}: {error}") from None
-    return f"{len(pictures.SCENES)} scenes in {len(pictures.TOLERANCES)} precisions"
+    return f"{len(golden.SCENES)} scenes in {len(golden.TOLERANCES)} precisions"
 
 
 def pruned(scene: ps.Gaussians, device: torch.device) -> str:
@@ -270,7 +270,7 @@ def main(
     begun = time.monotonic()
     what = torch.cuda.get_device_name(place) if place.type == "cuda" else place.type
     print(f"{what}, torch {torch.__version__}, {torch.get_num_threads()} threads", flush=True)
-    results = [passes("reference pictures", partial(reference_pictures_agree, place))]
+    results = [passes("golden pictures", partial(golden_pictures, place))]
     small = scenes_of(every)
     for name, scene in small.items():
         results.append(passes(f"prune, {name}", partial(pruned, scene, place)))

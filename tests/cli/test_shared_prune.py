@@ -7,20 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from killing import KILLED_AFTER_STEPS
 from making import normal_scene, quick_start
 from pointsplat_ns.io import write_ply
 
 PROGRAM = """
-import os, signal, sys
-def killed_after_steps(count):
-    left = [count]
-    def heard(event, args):
-        if event == "os.rename" and "cells" in str(args[1]):
-            left[0] -= 1
-            if left[0] == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-    sys.addaudithook(heard)
-
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import prune_file
 prune_file.MEMORY = prune_file.MemorySettings(base=0, least=100)
@@ -32,7 +23,7 @@ main(["prune", "scene.ply", "--keep", "10%", *sys.argv[2:]])
 def pruned(folder: Path, *words: object, killed_at: int = 0) -> tuple[int, str]:
     """Exit status and text of a command, killed after some of its first process's steps unless that is 0."""
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, f"{killed_at}", *map(str, words)], cwd=folder,
+        [sys.executable, "-c", KILLED_AFTER_STEPS + PROGRAM, f"{killed_at}", *map(str, words)], cwd=folder,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, env=quick_start(),
     )  # fmt: skip
     return done.returncode, done.stdout

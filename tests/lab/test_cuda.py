@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-import reference_pictures
+import golden
 from lab.speed import cuda
 from pointsplat_ns.errors import PointSplatError
 from pretend_gpu import GPU, pretend_gpu
 
 CHECKS = (
-    "reference pictures", "prune, the room that ships", "compact, the room that ships", "prune, bare walls",
+    "golden pictures", "prune, the room that ships", "compact, the room that ships", "prune, bare walls",
     "compact, bare walls", "training of a scene, resumed", "training of a refiner, resumed", "times of torch",
 )  # fmt: skip
 
@@ -41,7 +41,7 @@ def test_a_device_fails_that_keeps_another_number_or_loses_more(found, said, cap
 
 def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys):
     monkeypatch.setattr(cuda, "rasterization", None)
-    monkeypatch.setattr(reference_pictures, "TOLERANCES", {torch.float32: (0.0, 0.0)})
+    monkeypatch.setattr(golden, "TOLERANCES", {torch.float32: (0.0, 0.0)})
     for name in ("pruned", "compacted"):
         monkeypatch.setattr(cuda, name, lambda *arguments: "not tried")
     for name in ("of_a_scene", "of_a_refiner"):
@@ -50,13 +50,13 @@ def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys)
         cuda.main(device="cpu", every=80)
     printed = capsys.readouterr().out
     assert ended.value.code == 1
-    assert "FAIL  reference pictures" in printed and "FAIL  times of torch" in printed and "6 of 8 passed" in printed
+    assert "FAIL  golden pictures" in printed and "FAIL  times of torch" in printed and "6 of 8 passed" in printed
 
 
 def test_what_is_compared_is_drawn_on_the_device(capsys):
     scene = cuda.scenes_of(80)["the room that ships"]
     with pretend_gpu() as gpu:
-        assert cuda.passes("reference pictures", lambda: cuda.reference_pictures_agree(GPU))
+        assert cuda.passes("golden pictures", lambda: cuda.golden_pictures(GPU))
         assert len(gpu.operations) > 1000
         assert cuda.passes("prune", lambda: cuda.pruned(scene, GPU))
         gpu.operations.clear()

@@ -1,4 +1,4 @@
-"""Small scenes with all that pictures depend on, drawn by the float64 reference and by the fast path."""
+"""Golden scenes with all that pictures depend on, drawn by the float64 reference and by the fast path."""
 
 import functools
 import math
@@ -22,7 +22,7 @@ by some tens of layers, and a gradient is a sum over pixels that partly cancel. 
 
 
 @dataclass(frozen=True)
-class Small:
+class Golden:
     """What a scene is like and how it is drawn."""
 
     seed: int
@@ -61,18 +61,18 @@ def _around_the_camera(scene: dict[str, Tensor]) -> None:
 
 
 SCENES = {
-    "colours": Small(0, sh_degree=None),
-    "degree 0 over a background": Small(1, sh_degree=0, background=(0.9, 0.5, 0.1)),
-    "degree 1": Small(2, sh_degree=1),
-    "degree 2 with depth": Small(3, sh_degree=2, render_mode="RGB+D"),
-    "degree 3 with expected depth": Small(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
-    "seven channels": Small(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
-    "antialiased": Small(6, mode="antialiased"),
-    "antialiased below a pixel": Small(7, mode="antialiased", change=_below_a_pixel),
-    "needles": Small(8, sh_degree=1, change=_needles),
-    "opaque": Small(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
-    "large and faint": Small(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
-    "around the camera": Small(
+    "colours": Golden(0, sh_degree=None),
+    "degree 0 over a background": Golden(1, sh_degree=0, background=(0.9, 0.5, 0.1)),
+    "degree 1": Golden(2, sh_degree=1),
+    "degree 2 with depth": Golden(3, sh_degree=2, render_mode="RGB+D"),
+    "degree 3 with expected depth": Golden(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
+    "seven channels": Golden(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
+    "antialiased": Golden(6, mode="antialiased"),
+    "antialiased below a pixel": Golden(7, mode="antialiased", change=_below_a_pixel),
+    "needles": Golden(8, sh_degree=1, change=_needles),
+    "opaque": Golden(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
+    "large and faint": Golden(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
+    "around the camera": Golden(
         11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera
     ),
 }
@@ -81,17 +81,17 @@ SCENES = {
 @functools.cache
 def made(name: str) -> dict[str, Tensor]:
     """The tensors of one of :data:`SCENES`, in numbers that float32 holds."""
-    small = SCENES[name]
-    random = np.random.RandomState(small.seed)  # whose numbers never change
+    golden = SCENES[name]
+    random = np.random.RandomState(golden.seed)  # whose numbers never change
 
     def normal(*shape: int) -> Tensor:
         return torch.from_numpy(random.standard_normal(shape))
 
     depth = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    coefficients = (0 if small.sh_degree is None else small.sh_degree) + 1
-    colors = torch.rand(0) if small.sh_degree is None else 0.3 * normal(COUNT, coefficients**2, 3)
-    if small.sh_degree is None:
-        colors = torch.from_numpy(random.uniform(size=(COUNT, small.channels)))
+    coefficients = (0 if golden.sh_degree is None else golden.sh_degree) + 1
+    colors = torch.rand(0) if golden.sh_degree is None else 0.3 * normal(COUNT, coefficients**2, 3)
+    if golden.sh_degree is None:
+        colors = torch.from_numpy(random.uniform(size=(COUNT, golden.channels)))
     scene = {
         "means": normal(COUNT, 3) * torch.tensor([0.9, 0.6, 0.5], dtype=torch.float64) + depth,
         "quats": normal(COUNT, 4),
@@ -99,15 +99,15 @@ def made(name: str) -> dict[str, Tensor]:
         "opacities": torch.from_numpy(random.uniform(0.2, 0.98, COUNT)),
         "colors": colors,
     }
-    small.change(scene)
+    golden.change(scene)
     angle = 0.15
     view = torch.eye(4, dtype=torch.float64)
     view[0, 0] = view[2, 2] = math.cos(angle)
     view[0, 2], view[2, 0] = math.sin(angle), -math.sin(angle)
     view[:3, 3] = torch.tensor([-0.4, 0.05, 0.1], dtype=torch.float64)
     K = torch.eye(3, dtype=torch.float64)
-    K[0, 0], K[1, 1] = small.focal
-    K[0, 2], K[1, 2] = small.principal
+    K[0, 0], K[1, 1] = golden.focal
+    K[0, 2], K[1, 2] = golden.principal
     return {name: value.float().double() for name, value in {**scene, "viewmat": view, "K": K}.items()}
 
 
@@ -121,17 +121,17 @@ def total(renders: Tensor, alphas: Tensor) -> Tensor:
 @functools.cache
 def drawn_by_reference(name: str) -> dict[str, Tensor]:
     """Of one of :data:`SCENES` image (H, W, channels), alphas (H, W, 1) and gradients of :func:`total`, float64."""
-    small, scene = SCENES[name], made(name)
+    golden, scene = SCENES[name], made(name)
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
     image, alphas, depths = rasterize_reference(
         *leaves.values(), scene["viewmat"], scene["K"], WIDTH, HEIGHT,
-        sh_degree=small.sh_degree, antialiased=small.mode == "antialiased",
+        sh_degree=golden.sh_degree, antialiased=golden.mode == "antialiased",
     )  # fmt: skip
-    if small.background is not None:
-        image = image + (1 - alphas) * torch.tensor(small.background, dtype=torch.float64)
-    if small.render_mode == "RGB+D":
+    if golden.background is not None:
+        image = image + (1 - alphas) * torch.tensor(golden.background, dtype=torch.float64)
+    if golden.render_mode == "RGB+D":
         image = torch.cat([image, depths], dim=-1)
-    if small.render_mode == "RGB+ED":
+    if golden.render_mode == "RGB+ED":
         image = torch.cat([image, depths / alphas.clamp_min(1e-10)], dim=-1)
     grads = torch.autograd.grad(total(image, alphas), list(leaves.values()), materialize_grads=True)
     of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
@@ -141,13 +141,13 @@ def drawn_by_reference(name: str) -> dict[str, Tensor]:
 def drawn(name: str, dtype: torch.dtype, device: torch.device | str = "cpu", **options) -> dict[str, Tensor]:
     """As :func:`drawn_by_reference`, by the fast path in some precision on a device; ``options`` are those of
     :func:`pointsplat_ns.rasterization`."""
-    small, scene = SCENES[name], made(name)
+    golden, scene = SCENES[name], made(name)
     leaves = {name: scene[name].to(device, dtype, copy=True).requires_grad_() for name in NAMES}
-    background = None if small.background is None else torch.tensor([small.background], device=device, dtype=dtype)
+    background = None if golden.background is None else torch.tensor([golden.background], device=device, dtype=dtype)
     renders, alphas, _ = rasterization(
         *leaves.values(), scene["viewmat"][None].to(leaves["means"]), scene["K"][None].to(leaves["means"]),
-        WIDTH, HEIGHT, sh_degree=small.sh_degree, backgrounds=background, render_mode=small.render_mode,
-        rasterize_mode=small.mode, **options,
+        WIDTH, HEIGHT, sh_degree=golden.sh_degree, backgrounds=background, render_mode=golden.render_mode,
+        rasterize_mode=golden.mode, **options,
     )  # fmt: skip
     grads = torch.autograd.grad(total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
     of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-import reference_pictures as pictures
+import golden
 from making import box_room, views_from_within
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.rasterizer import scene as scene_module
@@ -25,13 +25,13 @@ if torch.cuda.is_available():
 
 
 @pytest.mark.parametrize("options", PATHS.values(), ids=PATHS)
-@pytest.mark.parametrize("dtype", pictures.TOLERANCES)
-@pytest.mark.parametrize("name", pictures.SCENES)
+@pytest.mark.parametrize("dtype", golden.TOLERANCES)
+@pytest.mark.parametrize("name", golden.SCENES)
 def test_every_path_draws_what_the_reference_draws(name, dtype, options):
-    pictures.compare(
-        pictures.drawn(name, dtype, **options),
-        pictures.drawn_by_reference(name),
-        *pictures.TOLERANCES[dtype],
+    golden.compare(
+        golden.drawn(name, dtype, **options),
+        golden.drawn_by_reference(name),
+        *golden.TOLERANCES[dtype],
     )
 
 
