@@ -224,6 +224,8 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
 def test_keys_differ_and_fit_into_names_of_files(room):
     subject = Subject(ps.load(room), room, "room", lambda: None)
     repairs = [Setting(40, 1, repair) for repair in REPAIRS]
-    keys = [subject.names(s)["key"] for s in (*repairs, Setting(40, 0), Setting(41, 1), Setting(40, 1, by="paper"))]
+    keys = [
+        subject.names(s)["key"] for s in (*repairs, Setting(40, 0), Setting(41, 1), Setting(40, 1, by="log-volume"))
+    ]
     assert len(set(keys)) == len(keys)
     assert all(character.isalnum() or character in "._-" for key in keys for character in key)
