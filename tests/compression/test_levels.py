@@ -125,14 +125,8 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize(
-    ("where", "error"),
-    [
-        ((Judge, "quality"), KeyboardInterrupt),
-        ((level_folder, "write_ply"), ps.SceneError),
-        ((level_folder, "_draw"), KeyboardInterrupt),
-    ],
-)
+@pytest.mark.parametrize("where", [(Judge, "quality"), (level_folder, "write_ply"), (level_folder, "_draw")])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ps.SceneError])
 def test_levels_that_fail_leave_nothing_and_the_old_ones_stay(where, error, scene, views, tmp_path, monkeypatch):
     def failing(*_, **__):
         raise error("now")
