@@ -43,14 +43,10 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     return seen, colors, dropped
 
 
-def _colors_of(
-    seen: Projected, colors: Colors, camera: int, per_camera: bool, sh_degree: int | None, compiled: bool | None = None
-) -> Tensor:
-    if isinstance(colors, Tensor):
-        colors = colors[camera] if per_camera else colors
-        if sh_degree is None:
-            return colors.index_select(0, seen.ids)
-    return sh_to_color(seen.directions, colors, cast(int, sh_degree), seen.ids, compiled)
+def _colors_of(seen: Projected, colors: Colors, sh_degree: int | None, compiled: bool | None) -> Tensor:
+    if sh_degree is None:
+        return cast(Tensor, colors).index_select(0, seen.ids)
+    return sh_to_color(seen.directions, colors, sh_degree, seen.ids, compiled)
 
 
 @full_precision
@@ -59,7 +55,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N] or [N, 1]
-    colors: Colors,  # [(C,) N, D] or [(C,) N, K, 3], or [N, 3] and [N, K - 1, 3]
+    colors: Colors,  # [N, D] or [N, K, 3], or [N, 3] and [N, K - 1, 3]
     viewmats: Tensor,  # [C, 4, 4], on any device
     Ks: Tensor,  # [C, 3, 3], on any device
     width: int,
@@ -106,9 +102,9 @@ def rasterization(
         quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
-        colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each. Or, for all cameras,
-            the first SH coefficient and the others as two tensors, as :class:`~pointsplat_ns.Gaussians` holds them:
-            bringing them together costs up to as much as drawing them.
+        colors: D channels, or SH coefficients if ``sh_degree`` is given. Or the first SH coefficient and the others as
+            two tensors, as :class:`~pointsplat_ns.Gaussians` holds them: bringing them together costs up to as much as
+            drawing them.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
@@ -178,7 +174,6 @@ def rasterization(
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
     viewmats, Ks = on_cpu(viewmats), on_cpu(Ks)
-    per_camera = isinstance(colors, Tensor) and colors.dim() == (4 if sh_degree is not None else 3)
 
     seen = [
         project(
@@ -190,7 +185,7 @@ def rasterization(
     skipped = count_meaningless(means, quats, scales, opacities)
     channels = []
     if render_mode.startswith("RGB"):
-        colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]
+        colored = [finite_colors(s, colors, sh_degree, compiled) for s in seen]
         seen = [projected for projected, _, _ in colored]
         channels.append(_cat([values for _, values, _ in colored]))
         skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
