@@ -105,7 +105,8 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
         means, scales = (value.detach().requires_grad_() for value in (scene.means, scene.scales))
         with torch.enable_grad():
             projected = project_scene(scene.replace(means=means, scales=scales), view)
-            colors = sh_to_color(projected.directions, scene.sh, scene.sh_degree, projected.ids)
+            sh = scene.features_dc, scene.features_rest
+            colors = sh_to_color(projected.directions, *sh, scene.sh_degree, projected.ids)
             in_plane = torch.cat([projected.opacities.log()[:, None], projected.means2d, projected.cov2d], dim=1)
             shape = _jacobian(in_plane, means, scales, projected.ids)  # (M, 6, 6)
             color = _jacobian(colors, means, scales, projected.ids)  # (M, 3, 6)

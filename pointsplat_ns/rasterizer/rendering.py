@@ -46,7 +46,8 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
 def _colors_of(seen: Projected, colors: Colors, sh_degree: int | None, compiled: bool | None) -> Tensor:
     if sh_degree is None:
         return cast(Tensor, colors).index_select(0, seen.ids)
-    return sh_to_color(seen.directions, colors, sh_degree, seen.ids, compiled)
+    first, rest = colors if isinstance(colors, tuple) else (colors[:, 0], colors[:, 1:])
+    return sh_to_color(seen.directions, first, rest, sh_degree, seen.ids, compiled)
 
 
 @full_precision
@@ -102,9 +103,8 @@ def rasterization(
         quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
-        colors: D channels, or SH coefficients if ``sh_degree`` is given. Or the first SH coefficient and the others as
-            two tensors, as :class:`~pointsplat_ns.Gaussians` holds them: bringing them together costs up to as much as
-            drawing them.
+        colors: D channels, or SH coefficients if ``sh_degree`` is given: one tensor, or two with the first coefficient
+            and the others, as :class:`~pointsplat_ns.Gaussians` holds them, which saves taking them apart.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
