@@ -30,7 +30,7 @@ from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
-from pointsplat_ns.merging.visibility import Viewpoints, views_and_weights
+from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
@@ -203,7 +203,7 @@ class Step:
     """Everything that is known between two rounds."""
 
     participants: Participants
-    viewpoints: Viewpoints | None
+    views: Views | None  # that visibility was computed in
     state: State
     rounds: tuple[Round, ...]
     reference: RendersOfSizes | None
@@ -216,15 +216,15 @@ def first_step(scene: Gaussians, k: int, views: Views | Sampler | None, settings
     scene = scene.to(device="cpu")
     with one_thread_each():
         participants = Participants.of(scene, drawable(scene, k))
-        viewpoints, weights = None, torch.ones(len(participants), **FLOATS)
+        found, weights = None, torch.ones(len(participants), **FLOATS)
         if len(participants) > last:
-            viewpoints, weights = views_and_weights(participants, views, settings)
+            found, weights = views_and_weights(participants, views, settings)
 
         def dense() -> Gaussians:
             return scene if len(participants) == len(scene) else scene[participants.members]
 
-        reference = _reference(participants, viewpoints, len(participants), dense, settings)
-        return Step(participants, viewpoints, initial_state(participants, weights), (), reference)
+        reference = _reference(participants, found, len(participants), dense, settings)
+        return Step(participants, found, initial_state(participants, weights), (), reference)
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
@@ -234,8 +234,7 @@ def most_pairs(n: int, settings: MergeSettings) -> int:
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    participants, viewpoints = step.participants, step.viewpoints
-    n = len(step.state)
+    participants, n = step.participants, len(step.state)
     most = min(n - k, most_pairs(n, settings))
     with one_thread_each():
         give_back_freed_memory()
@@ -250,20 +249,20 @@ def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
         def remaining() -> Gaussians:
             return scene_maker(participants, Groups.of(participants, state, rounds), settings)[1](0.0)
 
-        reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
+        reference = step.reference or _reference(participants, step.views, len(state), remaining, settings)
     return replace(step, state=state, rounds=rounds, reference=reference)
 
 
 def _reference(
     participants: Participants,
-    viewpoints: Viewpoints | None,
+    views: Views | None,
     count: int,
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
 ) -> RendersOfSizes | None:
     """Renders of ``count`` Gaussians ``dense`` that results are compared with, in every few pixels of pictures of
-    the middle size; None if they are too many or there are no viewpoints."""
-    if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
+    the middle size; None if they are too many or there are no views."""
+    if views is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
-    views = participants.views_in_units(viewpoints.views.spread(settings.finish_views))
+    views = participants.views_in_units(views.spread(settings.finish_views))
     return RendersOfSizes(participants.in_units(dense()), views, [middle_side(views)])

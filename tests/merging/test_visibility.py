@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, cloud, normal_scene, photographed
+from making import ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
@@ -16,7 +16,6 @@ from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
 from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.merging.visibility import (
-    Viewpoints,
     covered_per_area,
     views_and_weights,
     visibility_weights,
@@ -79,8 +78,8 @@ def test_an_occluded_gaussian_has_a_small_weight():
 def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
     scene = two_walls()
     participants = Participants.of(scene, torch.arange(len(scene)))
-    viewpoints = Viewpoints(views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size))
-    found = visibility_weights(participants, viewpoints, replace(MERGING, max_count_drawn=max_count))
+    views = views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size)
+    found = visibility_weights(participants, views, replace(MERGING, max_count_drawn=max_count))
     assert found.shape == (len(scene),)
     front = scene.means[participants.members, 2] < 0
     if max_count > 3:
@@ -105,22 +104,15 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
         assert found.tolist() == [1.0] * 400
 
 
-@pytest.mark.parametrize("found_photos", [True, False])
-def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_photos):
-    monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, views, settings: torch.full((30,), 0.5))
-    monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((30,), 16.0))
-    viewpoints = Viewpoints(of_origin((0, -6, 1)), photos_found=found_photos)
-    found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, MERGING)
-    assert found.tolist() == [8.0 if found_photos else 0.5] * 30
-
-
-def test_sampled_viewpoints_say_whether_photo_places_are_sure_and_fog_has_none():
+def test_traces_count_where_the_scene_tells_of_its_photos_and_fog_has_no_views(monkeypatch):
+    monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, *_: torch.full((len(rows),), 0.5))
+    monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0))
     settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
     fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
-    for scene, found in ((photographed(), True), (ball(500, 0), False), (fog, None)):
+    for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):
         participants = Participants.of(scene, torch.arange(len(scene)))
-        viewpoints, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
-        assert (viewpoints and viewpoints.photos_found) == found and weights.shape == (len(scene),)
+        views, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
+        assert weights.tolist() == [weight] * len(scene) and (views is None) == (scene is fog)
 
 
 @pytest.mark.parametrize(
