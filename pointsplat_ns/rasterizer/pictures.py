@@ -102,7 +102,7 @@ def picture(scene: Gaussians, camera: Camera, alpha_min: float, most_pairs: int)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
     on_threads(pairs.numel() >= SEVERAL, KERNELS.library.pointsplat_blend, task)
-    colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
+    colors, through = (untiled(values, whole)[: lens.height, : lens.width] for values in (image, final))
     return colors, 1.0 - through, count_meaningless(*tensors)
 
 

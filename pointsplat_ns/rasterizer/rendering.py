@@ -183,12 +183,11 @@ def rasterization(
         for c in range(cameras)
     ]  # fmt: skip
     skipped = count_meaningless(means, quats, scales, opacities)
-    channels = []
+    colored: list[Tensor] = []  # of each camera
     if render_mode.startswith("RGB"):
-        colored = [finite_colors(s, colors, sh_degree, compiled) for s in seen]
-        seen = [projected for projected, _, _ in colored]
-        channels.append(_cat([values for _, values, _ in colored]))
-        skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
+        finite = [finite_colors(s, colors, sh_degree, compiled) for s in seen]
+        seen, colored = [projected for projected, _, _ in finite], [values for _, values, _ in finite]
+        skipped += torch.cat([bad for _, _, bad in finite]).unique().numel()
     camera_ids = _cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     drawn = Projected(**{f.name: _cat([getattr(s, f.name) for s in seen]) for f in fields(Projected)})
     dense_ids = camera_ids * n + drawn.ids
@@ -202,28 +201,34 @@ def rasterization(
     else:
         meta_means2d = dense(drawn.means2d)
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
-    drawn = replace(drawn, means2d=means2d)
 
-    color_channels = channels[0].shape[-1] if channels else 0
-    if render_mode != "RGB":
-        channels.append(drawn.depths[:, None])
+    images, throughs = [], []
+    absolute: dict[int, Tensor] = {}
+    for c, own in enumerate(means2d.split([len(s.ids) for s in seen])):
+        channels = [colored[c]] if colored else []
+        if render_mode != "RGB":
+            channels.append(seen[c].depths[:, None])
 
-    footprints = Footprints(drawn, camera_ids, cameras, width, height, QUALITIES[quality], compiled)
+        def keep_absgrad(values: Tensor, c: int = c) -> None:
+            absolute[c] = values
+            if len(absolute) == cameras:
+                of_all = _cat([absolute.pop(camera) for camera in range(cameras)])
+                of_all = of_all if packed else dense(of_all)
+                setattr(meta_means2d, "absgrad", of_all)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
-    def keep_absgrad(values: Tensor) -> None:
-        if not packed:
-            values = values.new_zeros(cameras * n, 2).index_copy_(0, dense_ids, values).view(cameras, n, 2)
-        setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
-
-    image, through = blend(
-        drawn, _cat(channels, dim=-1), footprints, compiled, memory_budget, keep_absgrad if absgrad else None
-    )
+        one = replace(seen[c], means2d=own)
+        footprints = Footprints(one, width, height, QUALITIES[quality], compiled)
+        absgrad_of = keep_absgrad if absgrad else None
+        image, through = blend(one, _cat(channels, dim=-1), footprints, compiled, memory_budget, absgrad_of)
+        images.append(image)
+        throughs.append(through)
+    image, through = torch.stack(images), torch.stack(throughs)
     accumulated = 1.0 - through
 
-    if backgrounds is not None and color_channels:
-        background = backgrounds.to(dtype)[:, None, None, :]
-        over = image[..., :color_channels] + through * background
-        image = torch.cat([over, image[..., color_channels:]], dim=-1)
+    if backgrounds is not None and colored:
+        shades = colored[0].shape[-1]
+        over = image[..., :shades] + through * backgrounds.to(dtype)[:, None, None, :]
+        image = torch.cat([over, image[..., shades:]], dim=-1)
     if render_mode.endswith("ED"):
         expected = image[..., -1:] / accumulated.clamp_min(1e-10)
         image = torch.cat([image[..., :-1], expected], dim=-1)

@@ -38,16 +38,22 @@ def test_gradcheck():
 
 
 def test_batched_cameras_equal_one_at_a_time_packed_or_not():
-    scene = splats_in_view(120, seed=8)
+    scene = leaves(splats_in_view(120, seed=8))
     cameras = [camera_askew(angle=a) for a in (-0.3, 0.2, 3.0)]  # the last looks away
     views, Ks = torch.stack([c[0] for c in cameras]), torch.stack([c[1] for c in cameras])
     w, h = 37, 29
     for packed in (False, True):
-        image, alpha, meta = rasterization(*scene, views, Ks, w, h, sh_degree=1, packed=packed)
+        options = {"sh_degree": 1, "packed": packed, "absgrad": True}
+        image, alpha, meta = rasterization(*scene, views, Ks, w, h, **options)
+        grads, absolute = torch.autograd.grad(image.square().sum(), scene), []
+        total = [torch.zeros_like(value) for value in scene]
         for c in range(3):
-            one, one_alpha, _ = rasterization(*scene, views[c : c + 1], Ks[c : c + 1], w, h, sh_degree=1)
-            torch.testing.assert_close(image[c], one[0], rtol=0, atol=1e-12)
-            torch.testing.assert_close(alpha[c], one_alpha[0], rtol=0, atol=1e-12)
+            one, one_alpha, of_one = rasterization(*scene, views[c : c + 1], Ks[c : c + 1], w, h, **options)
+            assert torch.equal(image[c], one[0]) and torch.equal(alpha[c], one_alpha[0])
+            total = list(map(torch.add, total, torch.autograd.grad(one.square().sum(), scene)))
+            absolute.append(of_one["means2d"].absgrad)
+        torch.testing.assert_close(list(grads), total, rtol=1e-12, atol=1e-12)
+        assert torch.equal(meta["means2d"].absgrad, torch.cat(absolute)) and absolute[0].any()
         rows = meta["radii"].shape
         assert rows == ((len(meta["gaussian_ids"]),) if packed else (3, 120))
         assert meta["means2d"].shape == (*rows, 2) and meta["conics"].shape == (*rows, 3)

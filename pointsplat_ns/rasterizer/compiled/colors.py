@@ -51,7 +51,7 @@ def _call(
     directions: Tensor, first: Tensor, rest: Tensor, ids: Tensor, degree: int, colors: Tensor, **grads: Tensor | None
 ) -> None:
     task = KERNELS.structs["Colors"](
-        directions=directions, first=first, rest=rest, first_row=3, rest_row=3 * rest.shape[1], ids=ids, count=len(ids),
+        directions=directions, first=first, rest=rest, rest_row=3 * rest.shape[1], ids=ids, count=len(ids),
         degree=degree, colors=colors, **grads,
     )  # fmt: skip
     on_threads(len(ids) >= SEVERAL, KERNELS.library.pointsplat_color, task)
