@@ -115,11 +115,11 @@ def prune(
             another format ("12MB.spz"), or "auto:35", the smallest scene whose renders reach 35 dB PSNR against those
             of the given scene ("auto" alone means 35). For .spz and .sog the count is searched.
         by: the method. "merge" replaces neighbours by one Gaussian each; the others keep Gaussians bit for bit:
-            "coverage", "paper" (eq. 3), "authors", "opacity", "volume", "log-volume", "area", "random", and
+            "coverage", "paper" (eq. 3), "authors", "opacity", "random", and
             "lightgaussian" and "pup", which score Gaussians in ``views``.
         sh: SH bands to keep: "all", up to a degree ("0" to "3"), or "auto", the lowest degree whose renders reach
             40 dB.
-        opacity_weight: lambda of "paper", "authors" and "log-volume", in [0, 1]; by default the paper's 0.3.
+        opacity_weight: lambda of "paper" and "authors", in [0, 1]; by default the paper's 0.3.
         clean: first remove Gaussians that cannot be drawn or seen; ``keep`` refers to the scene as given.
         views: cameras for all rendering: views, the run whose dataset has the poses, or a file of cameras
             (``cameras.json`` of 3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model). By

@@ -31,8 +31,8 @@ class PointSplatError(Exception):
         ...     ps.prune(ps.example_room(), by="magic")
         ... except ps.PointSplatError as error:
         ...     print(error)
-        no method is called 'magic'; expected one of merge, coverage, paper, authors, opacity, volume, log-volume, \
-area, random, lightgaussian, pup
+        no method is called 'magic'; expected one of merge, coverage, paper, authors, opacity, random, \
+lightgaussian, pup
     """
 
     def __str__(self) -> str:

@@ -24,10 +24,9 @@ from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.merging.duplicates import Copies
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.system.tensors import DOUBLES, INDICES
+from pointsplat_ns.system.tensors import DOUBLES
 
 
 @dataclass(frozen=True)
@@ -159,9 +158,6 @@ def _suspicious(scene: Gaussians, usable: Tensor) -> dict[str, int]:
         "opacity of exactly 0 or 1": int(good.opacities.isinf().sum()),
         "too faint to be drawn": int((good.alphas < ALPHA_MIN).sum()),
         "zero quaternion": int((good.quats.abs().amax(dim=1) < SHORTEST).sum()) if len(good) else 0,
-        "exact copy of another": len(good) - Copies(good, torch.arange(len(good), **INDICES)).distinct
-        if len(good)
-        else 0,
     }
     return {what: count for what, count in counts.items() if count}
 

@@ -24,18 +24,7 @@ EPS2D = 0.3
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One pinhole camera and its rendering settings. An element of :class:`Views`.
-
-    Attributes:
-        viewmat: (4, 4), takes world to camera coordinates, OpenCV axes (x right, y down, z forward); a rigid motion
-            in scene units.
-        K: (3, 3) intrinsics in pixels, the first pixel's centre at (0.5, 0.5).
-        width: width of the image, pixels.
-        height: height of the image, pixels.
-        background: (3,) colour behind the scene, RGB in [0, 1].
-        rasterize_mode: "classic" or "antialiased", as in the scene's training.
-        near_plane: least depth of drawn Gaussians, scene units; gsplat's by default.
-        eps2d: added to the diagonal of each projected covariance, pixels^2; 3DGS' by default.
+    """One pinhole camera and its rendering settings: an element of :class:`Views`, which explains its attributes.
 
     Example:
         >>> import pointsplat_ns as ps

@@ -1,4 +1,4 @@
-"""The public API: the ten lines, what each name is and says, and that the command line does nothing else."""
+"""The public API: what each name is and says, and that the command line does nothing else."""
 
 import doctest
 import inspect
@@ -13,46 +13,6 @@ import torch
 import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.cli import main
-from pointsplat_ns.pruning import resolve_keep
-
-pytestmark = pytest.mark.xdist_group("api")  # one worker runs the ten lines for all tests of this file
-
-TEN_LINES = """
-import pointsplat_ns as ps
-scene   = ps.load("room.ply")                     # any format, a checkpoint, a run
-small   = ps.prune(scene, keep="10%")             # by="merge" is the default
-refiner = ps.load_refiner()                       # the one that ships; or a path, or a run
-refined = ps.refine(small, refiner)
-views   = ps.sample_views(scene, 12)
-image   = ps.render(refined, views[0])            # [H, W, 3]
-print(ps.psnr(image, ps.render(scene, views[0])))
-result  = ps.compact(scene, keep="10%")           # .scene, .accepted, .psnr, .seconds
-ps.save(result.scene, "small.ply")
-"""
-
-
-@pytest.fixture(scope="module")
-def ten_lines(tmp_path_factory) -> dict:
-    """What the ten lines leave behind, with an eighth of the scene that ships as room.ply."""
-    folder = tmp_path_factory.mktemp("ten_lines")
-    ps.save(ps.example_room()[::8], folder / "room.ply")
-    names: dict = {"folder": folder}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        exec(TEN_LINES, names)
-    return names
-
-
-def test_the_ten_lines_make_a_scene_of_a_tenth(ten_lines):
-    tenth = resolve_keep(len(ten_lines["scene"]), "10%")
-    assert len(ten_lines["small"]) == len(ten_lines["refined"]) == len(ten_lines["result"].scene) == tenth
-
-
-def test_the_ten_lines_compact_what_they_prune(ten_lines):
-    result = ten_lines["result"]
-    assert same(result.pruned, ten_lines["small"])
-    assert not result.accepted and result.psnr >= result.before.psnr > 15
-    assert 0 < result.seconds < 3600
 
 
 @pytest.mark.parametrize("name", ps.__all__)
@@ -67,11 +27,6 @@ def test_every_public_name_is_documented_with_an_example_that_runs(name):
 
 def test_dir_lists_the_public_names_alone():
     assert sorted(name for name in dir(ps) if not name.startswith("_")) == sorted(ps.__all__)
-
-
-def test_views_are_shown_in_one_short_line():
-    views = ps.sample_views(ps.example_room(), 3, width=64, height=48)
-    assert repr(views) == "Views(3 of 64 x 48 pixels, classic)"
 
 
 def test_render_says_what_it_expects_for_views():
@@ -179,14 +134,12 @@ def saved(scene: ps.Gaussians, folder: Path) -> bytes:
 @pytest.mark.parametrize(
     ("arguments", "options"),
     [
-        ((), {}),
         (
             ("--keep", "50", "--by", "paper", "--opacity-weight", "0.7", "--sh", "0"),
             {"keep": 50, "by": "paper", "opacity_weight": 0.7, "sh": "0"},
         ),
         (("--keep", "0.01MB", "--sh", "auto"), {"keep": "0.01MB", "sh": "auto"}),
         (("--keep", "auto:20", "--by", "coverage"), {"keep": "auto:20", "by": "coverage"}),
-        (("--keep", "20%", "--by", "area", "--clean"), {"keep": 0.2, "by": "area", "clean": True}),
     ],
 )
 def test_pointsplat_prune_writes_what_prune_gives(arguments, options, ply, tmp_path):

@@ -7,14 +7,8 @@ import torch
 
 from making import normal_scene, same
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.gaussians import Gaussians, sh_degree_of
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.views import Views
-
-
-@pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
-def test_sh_degree_follows_from_the_number_of_coefficients(rest, degree):
-    assert sh_degree_of(rest) == degree
-    assert normal_scene(4, degree).sh_degree == degree
 
 
 @pytest.mark.parametrize(
@@ -70,10 +64,6 @@ def test_activated_values_at_the_extremes():
     assert scene.stds[0].tolist() == pytest.approx([0.0, 1.0, math.e])
 
 
-def test_megabytes_count_59_floats_a_gaussian_at_degree_3():
-    assert normal_scene(1000).megabytes == pytest.approx(0.236)
-
-
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "opacities", "features_dc", "features_rest"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
@@ -96,12 +86,6 @@ def make(count=5, width=64, height=48, mode="antialiased"):
 
 def places(views):
     return [-view.viewmat[0, 3].item() for view in views]
-
-
-def test_a_view_is_drawn_as_its_views_are():
-    view = make()[2]
-    assert (view.width, view.height, view.rasterize_mode) == (64, 48, "antialiased")
-    assert torch.equal(view.background, torch.tensor([0.1, 0.2, 0.3]))
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.state import Participants, initial_state
-from pointsplat_ns.pruning.baselines import log_volume_score
 from pointsplat_ns.pruning.paper import paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.rasterizer import rasterization
@@ -175,7 +174,6 @@ def _scores(given: Case, scene: Gaussians, truth: Gaussians) -> Iterator[tuple[s
     views = given.views()
     kinds = {
         "paper": paper_score,
-        "log-volume": log_volume_score,
         "LightGaussian": functools.partial(lightgaussian_score, views=views),
         "PUP-3DGS": functools.partial(pup_score, views=views),
     }

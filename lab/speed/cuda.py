@@ -2,9 +2,9 @@
 
     python -m lab.speed.cuda
 
-Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships: golden pictures, the
-room, and photos of a room that are made. It takes at most four minutes, and gsplat, if it is installed, as long as its
-kernels take to compile when first used, which is why it comes last.
+Checks say pass or fail, and the status is 0 if all pass. They need no other data than what ships: golden pictures,
+the room, and photos of a room that are made. It takes at most four minutes, and gsplat, if it is installed, as long as
+its kernels take to compile when first used, which is why it comes last.
 """
 
 from __future__ import annotations
@@ -55,15 +55,14 @@ def scenes_of(every: int) -> dict[str, ps.Gaussians]:
 
 
 def golden_pictures(device: torch.device) -> str:
-    """The stored pictures and gradients of small scenes are drawn, in both precisions."""
+    """Pictures and gradients of small scenes are those of the float64 reference, in both precisions."""
     sys.path.insert(0, str(SUPPORT))
     import golden
 
-    stored = golden.stored()
-    for name, scene in golden.SCENES.items():
+    for name in golden.SCENES:
         for dtype, tolerances in golden.TOLERANCES.items():
             try:
-                golden.compare(golden.drawn(scene, stored[name], dtype, device), stored[name], *tolerances)
+                golden.compare(golden.drawn(name, dtype, device), golden.drawn_by_reference(name), *tolerances)
             except AssertionError as error:
                 raise AssertionError(f"{name}, {dtype}: {error}") from None
     return f"{len(golden.SCENES)} scenes in {len(golden.TOLERANCES)} precisions"

@@ -79,14 +79,14 @@ class Case:
         """Seconds of blending both ways as in training, compiled where it is so by default, without the lists of
         tiles, and of one exponential in numbers that stay in the cache, on one thread."""
         seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
-        colors = sh_to_color(seen.directions, self.tensors[4], 3, seen.ids)
+        colors = sh_to_color(seen.directions, self.tensors[4][:, 0], self.tensors[4][:, 1:], 3, seen.ids)
         leaves = [t.detach().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, colors)]
         seen = replace(seen, **dict(zip(("means2d", "cov2d", "det", "opacities"), leaves, strict=False)))
-        footprints = Footprints(seen, None, 1, self.width, self.height)
+        footprints = Footprints(seen, self.width, self.height)
         marks = [now()]
         drawn = blend(seen, leaves[4], footprints)
         marks.append(now())
-        torch.autograd.grad(drawn, leaves, (self.grads[0][None], -self.grads[1][None]))
+        torch.autograd.grad(drawn, leaves, (self.grads[0], -self.grads[1]))
         marks.append(now())
         footprints.tiles(footprints.whole)
         marks.append(now())

@@ -53,8 +53,8 @@ def prune(
             the smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
         by: merge replaces neighbours by one Gaussian each and is by far the best; every other method keeps Gaussians as
             they are: coverage (empties no region), paper (eq. 3), authors (the formula of its released code), opacity,
-            volume, log-volume, area, random; lightgaussian and pup score by views of the scene.
-        opacity_weight: lambda of paper, authors and log-volume: the weight of opacity; by default the paper's 0.3.
+            random; lightgaussian and pup score by views of the scene.
+        opacity_weight: lambda of paper and authors: the weight of opacity; by default the paper's 0.3.
         sh: SH bands to keep: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         clean: first remove Gaussians that cannot be drawn or seen; --keep refers to the scene as read.
         photos: also print PSNR in held-out photos: of the dataset of a run, or every eighth photo, by name, in FOLDER.

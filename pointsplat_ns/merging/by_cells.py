@@ -32,23 +32,28 @@ from pointsplat_ns.io.ply_writing import header_bytes, ply_bytes, row_table
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
-from pointsplat_ns.merging.duplicates import Copies
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.matching import candidate_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.replacement import replace_pairs
-from pointsplat_ns.merging.rounds import merge, most_pairs, views_and_weights
+from pointsplat_ns.merging.replacement import Round, replace_pairs
+from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import ColourAxes, Participants, State, drawable, initial_state, principal_axes
+from pointsplat_ns.merging.state import (
+    OF_EACH,
+    ColourAxes,
+    Participants,
+    State,
+    drawable,
+    initial_state,
+    principal_axes,
+)
+from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.views import Views
-
-_OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
-"""Tensors of a state that have a row for each Gaussian."""
 
 
 @torch.no_grad()
@@ -203,7 +208,7 @@ class _Work:
             costs = pair_costs(state, near, self.settings)
             first, second, prices = candidate_pairs(near, costs, self.settings.matching_passes)
         pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
-        return {**{name: getattr(state, name) for name in _OF_EACH}, "group": group.int(), **pairs}
+        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
 
     def _state(self, number: int, cell: int) -> tuple[State, Tensor]:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
@@ -212,15 +217,12 @@ class _Work:
             return state, torch.arange(len(state), **INDICES)
         scratch = self.cells.scratch
         before = scratch.known(_round(number - 1, cell))
-        of_each = {name: before[name] for name in _OF_EACH}
+        of_each = {name: before[name] for name in OF_EACH}
         state = State(**of_each, centre=self.overview.centre, size=float(self.overview.size))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))
-        stays = torch.ones(len(state), **FLAGS)
-        stays[second] = False
-        place = stays.cumsum(0) - 1
-        place[second] = place[first]
-        return replace_pairs(state, first, second, self.settings)[0], place[before["group"].long()]
+        after, merged = replace_pairs(state, first, second, self.settings)
+        return after, merged.place[before["group"]].long()
 
     def _first_state(self, cell: int) -> State:
         participants = self._participants(cell)
@@ -230,11 +232,9 @@ class _Work:
 
     def _participants(self, cell: int) -> Participants:
         scene = self.cells.read(cell)
-        few = -(-len(scene) * self.k // self.cells.count)
-        copies = Copies(scene, drawable(scene, few))
-        reduced = copies.reduced(max(few, copies.distinct))
-        order = self.cells.keys_of(reduced.scene)[reduced.members].argsort(stable=True)
-        return Participants(reduced.scene, reduced.members[order], self.overview.centre, float(self.overview.size))
+        members = drawable(scene, -(-len(scene) * self.k // self.cells.count))
+        order = self.cells.keys_of(scene)[members].argsort(stable=True)
+        return Participants(scene, members[order], self.overview.centre, float(self.overview.size))
 
     def _size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """The finish of the parts in this cell, of four parts that are evenly spread over all cells.
@@ -258,7 +258,7 @@ class _Work:
         with one_thread_each():
             state, group = self._state(rounds, cell)
             participants = self._participants(cell)
-            groups = Groups.of(participants, state, group, torch.ones(len(group), **FLOATS))
+            groups = Groups.of(participants, state, [Round(group, torch.ones(len(group), **FLOATS))])
             del state
             if groups.any_merged:
                 groups = regrouped(participants, groups, self.settings)

@@ -14,7 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import in_pieces
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import most_threads
 
 MIN_DIVISOR = 1e-300
@@ -143,11 +143,3 @@ def _by_kernels(log_scales: Tensor, quats: Tensor, rows: Tensor) -> Tensor:
     )
     on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task, threads=most_threads())
     return cov
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernel computes the covariances of some Gaussians as torch does."""
-    log_scales, quats = torch.randn(90, 7, generator=torch.Generator().manual_seed(0), **FLOATS).split([3, 4], dim=1)
-    torchs = covariances(log_scales[::2].double(), quats[::2].double())
-    return torch.allclose(_by_kernels(log_scales, quats, torch.arange(0, 90, 2, **INDICES)), torchs, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""How groups become a scene: members are regrouped, and one factor for all sizes is chosen by renders.
+"""One factor for the sizes of all merged Gaussians, chosen by renders.
 
 How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
 and differs between scenes. The factor is chosen by the PSNR against the dense scene in pictures of the
@@ -10,16 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-
-from torch import Tensor
-
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sizes import RendersOfSizes
-from pointsplat_ns.merging.groups import Groups, scene_maker
-from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.settings import MergeSettings
-from pointsplat_ns.merging.state import Participants
-from pointsplat_ns.system.memory import give_back_freed_memory
 
 
 @dataclass(frozen=True)
@@ -40,32 +30,6 @@ class Finish:
         if self.psnr is None or self.psnr_before is None:
             return f"{factor}, by default"
         return f"{factor}, chosen by renders: {self.psnr_before:.2f} -> {self.psnr:.2f} dB"
-
-
-def finished(
-    participants: Participants, groups: Groups, reference: RendersOfSizes | None, regroup: bool, settings: MergeSettings
-) -> tuple[Tensor, Gaussians, Finish]:
-    """The group (n,) of each participant, in the order of their first members, and the scene of the groups with the
-    finish that suits it.
-
-    Args:
-        participants: n Gaussians.
-        groups: after the last round.
-        reference: renders that the scene is compared with; None compares nothing.
-        regroup: whether members may change groups.
-        settings: of regrouping.
-    """
-    any_merged = groups.any_merged
-    if regroup and any_merged and settings.regrouping_rounds > 0:
-        groups = regrouped(participants, groups, settings)
-    give_back_freed_memory()
-    group, make = scene_maker(participants, groups, settings)
-    del groups
-    give_back_freed_memory()
-    finish = Finish()
-    if reference is not None and any_merged:
-        finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))))
-    return group, make(finish.size_change), finish
 
 
 def best_finish(psnr_of: Callable[[float], float]) -> Finish:

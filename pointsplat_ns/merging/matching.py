@@ -105,14 +105,3 @@ def _by_kernels(near: Tensor, costs: Tensor, passes: int) -> tuple[Tensor, Tenso
     KERNELS.library.pointsplat_match(task)
     first, second, price = (values[: int(found)] for values in pairs)
     return first, second, price
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernels find some pairs as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    offsets = torch.tensor([-9, -2, -1, 1, 2, 5], **INDICES)
-    near = ((torch.arange(200, **INDICES)[:, None] + offsets) % 200).to(torch.int32)
-    costs = torch.randint(9, (200, 6), generator=generator, device="cpu").float()  # many of them equal
-    found = [function(near, costs.clone(), 4) for function in (_by_kernels, _candidates)]
-    return all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -41,11 +41,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.merging.covariance import pack, plane_axes
+from pointsplat_ns.merging.covariance import plane_axes
 from pointsplat_ns.merging.replacement import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, agreement, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import in_threads, most_threads
 
@@ -210,23 +210,3 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
         on_threads(count >= SEVERAL, function, task, threads=most_threads())
     return costs
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernels compute the costs of some pairs as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    count = 90
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **FLOATS)
-
-    factors = 0.1 * random(count, 3, 3)
-    state = State(
-        means=random(count, 3) - 0.5, cov=pack(factors @ factors.mT), alphas=random(count), colours=random(count, 5),
-        weights=random(count), counts=torch.ones(count, dtype=torch.int32, device="cpu"),
-        centre=torch.zeros(3, **DOUBLES), size=1.0,
-    )  # fmt: skip
-    near = torch.randint(count, (count, 9), generator=generator, dtype=torch.int32, device="cpu")
-    ours, torchs = _by_kernels(state, near, MERGING), pair_costs(state, near, compiled=False)
-    return agreement([ours], [torchs], off=1e-4, share=1e-2)

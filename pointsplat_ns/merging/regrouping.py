@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -70,17 +69,6 @@ class Members:
     def colours(self, these: slice) -> Tensor:
         """Colours (m, 3) float32 of SH degree 0 of a piece, colour units."""
         return bounded_colours(self._scene.features_dc[self._rows[these]])
-
-    def __getitem__(self, these: slice) -> Piece:
-        return Piece(self.means(these), self.cov(these), self.colours(these))
-
-
-class Piece(NamedTuple):
-    """m members, in the numbers by which they choose."""
-
-    means: Tensor  # [m, 3] float64, scene units
-    cov: Tensor  # [m, 6] float64, squared scene units
-    colours: Tensor  # [m, 3] float32 of SH degree 0, colour units
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +179,12 @@ def best_groups(
     result = torch.empty_like(group)
     fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, 6)
     for these in members.pieces():
-        piece, own = members[these], group[these]
-        near = nearest(piece.means)
+        means, own = members.means(these), group[these]
+        piece, near = (means, members.cov(these), members.colours(these)), nearest(means)
         if KERNELS.usable(compiled):
-            result[these] = _by_kernels(piece, own, near.int(), fits)
+            result[these] = _by_kernels(*piece, own, near.int(), fits)
         else:
-            result[these] = fits.best_of(piece, torch.cat([own[:, None], near], dim=1))
+            result[these] = fits.best_of(*piece, torch.cat([own[:, None], near], dim=1))
     heaviest = torch.zeros(len(groups.mass), **DOUBLES).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
 
@@ -225,39 +213,24 @@ class Fits:
             log_determinants[these] = torch.logdet(shapes) + 3 * variance.log()
         return cls(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
 
-    def best_of(self, piece: Piece, candidates: Tensor) -> Tensor:
+    def best_of(self, means: Tensor, cov: Tensor, colours: Tensor, candidates: Tensor) -> Tensor:
         """The candidate that each of m members fits best, of groups (m, c) int64; the first of equals."""
-        apart = piece.means[:, None] - self.means[candidates]
-        second = piece.cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
+        apart = means[:, None] - self.means[candidates]
+        second = cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
         fit = 0.5 * ((second * self.inverse[candidates]).sum(2) + self.log_determinants[candidates])
-        contrast = piece.colours[:, None] - self.colours[candidates]
+        contrast = colours[:, None] - self.colours[candidates]
         fit += contrast.square().sum(2) * self.colour_weight
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)
         return candidates.gather(1, best)[:, 0]
 
 
-def _by_kernels(piece: Piece, group: Tensor, near: Tensor, fits: Fits) -> Tensor:
+def _by_kernels(means: Tensor, cov: Tensor, colours: Tensor, group: Tensor, near: Tensor, fits: Fits) -> Tensor:
     """As :meth:`Fits.best_of` for m members, each with its own group (m,) and the nearest (m, k) int32."""
     best = torch.empty_like(group)
     task = KERNELS.structs["Choice"](
-        means=piece.means, cov=piece.cov, colours=piece.colours, group=group, near=near, count=len(group),
+        means=means, cov=cov, colours=colours, group=group, near=near, count=len(group),
         candidates=near.shape[1], group_means=fits.means, inverse=fits.inverse,
         log_determinants=fits.log_determinants, group_colours=fits.colours, colour_weight=fits.colour_weight, best=best,
     )  # fmt: skip
     on_threads(len(group) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
     return best
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernel chooses the groups of some members as torch does."""
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, **DOUBLES)
-
-    piece = Piece(random(90, 3), random(90, 6), random(90, 3).float())
-    fits = Fits(random(9, 3), random(9, 6), random(9), random(9, 3), 2.0)
-    group, near = (torch.randint(9, shape, generator=generator, device="cpu") for shape in ((90,), (90, 4)))
-    torchs = fits.best_of(piece, torch.cat([group[:, None], near], dim=1))
-    return torch.equal(_by_kernels(piece, group, near.int(), fits), torchs)

@@ -15,6 +15,7 @@ both members cover and the replacement covers once. Where a_k is above the large
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,11 +31,18 @@ from pointsplat_ns.merging.covariance import (
     thinnest_axes,
 )
 from pointsplat_ns.merging.settings import MergeSettings
-from pointsplat_ns.merging.state import State
+from pointsplat_ns.merging.state import OF_EACH, State
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 
 
-def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Tensor]:
+class Round(NamedTuple):
+    """What a round made of n Gaussians."""
+
+    place: Tensor  # [n] int32, index of the Gaussian that each became or was merged into
+    shares: Tensor  # [n] float32, of each in that one's mass
+
+
+def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSettings) -> tuple[State, Round]:
     """Replace disjoint pairs, each in the place of its first member.
 
     Args:
@@ -43,15 +51,15 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
         settings: ``max_opacity`` and ``growth_exponent``.
 
     Returns:
-        The state of n - E Gaussians, and the share of the first member in each pair's mass, (E,) float32.
+        The state of n - E Gaussians, and which of the n they were.
     """
     stays = torch.ones(len(state), **FLAGS)
     stays[second] = False
     place = stays.cumsum(0) - 1
+    place[second] = place[first]
     rows = stays.nonzero()[:, 0]
-    names = ("means", "cov", "alphas", "colours", "weights", "counts")
-    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in names})
-    shares = torch.empty(len(first), **FLOATS)
+    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in OF_EACH})
+    shares = torch.ones(len(state), **FLOATS)
     for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
         i, j = first[part], second[part]
         k = place[i]
@@ -63,8 +71,8 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
         after.colours[k] = share[:, None] * state.colours[i] + other[:, None] * state.colours[j]
         after.weights[k] = share * state.weights[i] + other * state.weights[j]
         after.counts[k] = state.counts[i] + state.counts[j]
-        shares[part] = share
-    return after, shares
+        shares[i], shares[j] = share, 1 - share
+    return after, Round(place.int(), shares)
 
 
 def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -22,15 +22,15 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
-from pointsplat_ns.merging.duplicates import Copies, Reduced
-from pointsplat_ns.merging.finishing import Finish, finished
-from pointsplat_ns.merging.groups import Groups, Tree, scene_maker
+from pointsplat_ns.merging.finishing import Finish, best_finish
+from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.replacement import replace_pairs
+from pointsplat_ns.merging.regrouping import regrouped
+from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
-from pointsplat_ns.merging.visibility import Viewpoints, sampled_viewpoints, visibility_weights
+from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
@@ -57,8 +57,7 @@ def merge(
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn are dropped first. Of the others, exact copies become one, and the rest is merged in
-    pairs, cheapest first.
+    Gaussians too faint to be drawn are dropped first. The others are merged in pairs, cheapest first.
 
     Args:
         scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
@@ -134,21 +133,17 @@ class Merger:
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
         """The result of :func:`merge`, to the bit. Arguments and errors as there."""
-        settings = self._options[-1]
+        views, settings = self._options
         if not self._steps and 1 <= k < len(self._scene):
-            dense = self._scene.to(device="cpu")
-            with one_thread_each():
-                copies = Copies(dense, drawable(dense, 1))
-                self._steps.append(first_step(copies.reduced(copies.distinct), *self._options))
-        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # copies or faint Gaussians are among them
-            return merge(self._scene, k, progress, *self._options)
+            self._steps.append(first_step(self._scene, 1, views, settings))
+        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # faint Gaussians are among them
+            return merge(self._scene, k, progress, views, settings)
         report = progress or (lambda share: None)
         step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
         while (n := len(step.state)) > k:
             shared = step is self._steps[-1] and n - most_pairs(n, settings) >= k
-            with one_thread_each():
-                step = one_round(step, k, settings)
+            step = one_round(step, k, settings)
             self._steps += [step] if shared else []
             report(0.95 * (first - len(step.state)) / max(first - k, 1))
         merged = _result(step, self._scene.device, True, settings)
@@ -171,89 +166,65 @@ def _levels(
         counts = counts[1:]
     if not counts:
         return
-    dense = scene.to(device="cpu")
-    with one_thread_each():
-        copies = Copies(dense, drawable(dense, counts[0]))
-    first, last = len(copies), counts[-1]
-    step: Step | None = None
+    last = counts[-1]
+    step = first_step(scene, counts[0], views, settings, last)
+    first = len(step.state)
     for k in counts:
-        left = max(k, copies.distinct)
-        if step is None or left < len(step.participants):
-            with one_thread_each():
-                step = first_step(copies.reduced(left), views, settings, pairs=left > last)
-        if k == last:
-            del copies
-        give_back_freed_memory()
         while len(step.state) > k:
-            with one_thread_each():
-                step = one_round(step, k, settings)
+            step = one_round(step, k, settings)
             report(0.95 * (first - len(step.state)) / max(first - last, 1))
-        merged = _result(step, scene.device, len(counts) == 1, settings, k == last)
+        merged = _result(step, scene.device, len(counts) == 1, settings)
         if k == last:
             report(1.0)
         yield merged
 
 
-def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings, last: bool = False) -> Merged:
-    """The result after some rounds, on a device. With ``last``, the step is not needed any more, and loses its state
-    and tree to save memory."""
-
-    def groups() -> Groups:
-        found = Groups.of(step.participants, step.state, step.tree.groups(), step.tree.shares())
-        if last:
-            del step.state, step.tree
-        return found
-
+def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
+    """The result after some rounds, on a device."""
+    participants = step.participants
     with one_thread_each():
-        group, scene, finish = finished(step.participants, groups(), step.reference, regroup, settings)
-    assignment = torch.full((len(step.participants.scene),), -1, **INDICES)
-    assignment[step.participants.members] = group
-    if step.index is not None:
-        assignment = assignment[step.index]
+        groups = Groups.of(participants, step.state, step.rounds)
+        any_merged, reference, finish = groups.any_merged, step.reference, Finish()
+        if regroup and any_merged and settings.regrouping_rounds > 0:
+            groups = regrouped(participants, groups, settings)
+        give_back_freed_memory()
+        group, make = scene_maker(participants, groups, settings)
+        del groups
+        if reference is not None and any_merged:
+            finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))))
+        scene = make(finish.size_change)
+    assignment = torch.full((len(participants.scene),), -1, **INDICES)
+    assignment[participants.members] = group
     return Merged(scene.to(device), assignment.to(device), finish)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Step:
     """Everything that is known between two rounds."""
 
-    index: Tensor | None  # [N] of Reduced
     participants: Participants
-    viewpoints: Viewpoints | None
+    views: Views | None  # that visibility was computed in
     state: State
-    tree: Tree
+    rounds: tuple[Round, ...]
     reference: RendersOfSizes | None
     """Renders of the scene, or of what remained once it was few enough to render."""
 
 
-def views_and_weights(
-    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
-) -> tuple[Viewpoints | None, Tensor]:
-    """The viewpoints, None for a small scene without known views, and the visibility weights (n,) of participants;
-    ``views`` as for :func:`merge`."""
-    viewpoints: Viewpoints | None = None
-    if isinstance(views, Views):
-        viewpoints = Viewpoints(views)
-    elif len(participants) >= settings.min_count_rendered:
-        viewpoints = sampled_viewpoints(views or Sampler(participants.scene), settings)
-    return viewpoints, visibility_weights(participants, viewpoints, settings)
+def first_step(scene: Gaussians, k: int, views: Views | Sampler | None, settings: MergeSettings, last: int = 0) -> Step:
+    """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`. Nothing is rendered
+    if they are no more than the ``last`` count, so that no round follows."""
+    scene = scene.to(device="cpu")
+    with one_thread_each():
+        participants = Participants.of(scene, drawable(scene, k))
+        found, weights = None, torch.ones(len(participants), **FLOATS)
+        if len(participants) > last:
+            found, weights = views_and_weights(participants, views, settings)
 
+        def dense() -> Gaussians:
+            return scene if len(participants) == len(scene) else scene[participants.members]
 
-def first_step(reduced: Reduced, views: Views | Sampler | None, settings: MergeSettings, pairs: bool = True) -> Step:
-    """The step before the first round; ``views`` as for :func:`merge`. Without ``pairs`` no round follows, so nothing
-    is rendered: a million copies, each of which covers the picture, would take as long as all else."""
-    participants = Participants.of(reduced.scene, reduced.members)
-    viewpoints, weights = None, torch.ones(len(participants), **FLOATS)
-    if pairs:
-        viewpoints, weights = views_and_weights(participants, views, settings)
-
-    def dense() -> Gaussians:
-        whole = len(participants) == len(participants.scene)
-        return participants.scene if whole else participants.scene[participants.members]
-
-    reference = _reference(participants, viewpoints, len(participants), dense, settings)
-    state = initial_state(participants, weights)
-    return Step(reduced.index, participants, viewpoints, state, Tree.of_single(len(state)), reference)
+        reference = _reference(participants, found, len(participants), dense, settings)
+        return Step(participants, found, initial_state(participants, weights), (), reference)
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
@@ -263,37 +234,35 @@ def most_pairs(n: int, settings: MergeSettings) -> int:
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    participants, viewpoints = step.participants, step.viewpoints
-    n = len(step.state)
+    participants, n = step.participants, len(step.state)
     most = min(n - k, most_pairs(n, settings))
-    near = other_neighbours(step.state.means.double(), settings.neighbours)
-    give_back_freed_memory()
-    costs = pair_costs(step.state, near, settings)
-    give_back_freed_memory()
-    first, second = cheapest_pairs(near, costs, most, settings.matching_passes)
-    del near, costs
-    give_back_freed_memory()
-    state, shares = replace_pairs(step.state, first, second, settings)
-    tree = step.tree.after_round(first, second, shares)
+    with one_thread_each():
+        give_back_freed_memory()
+        near = other_neighbours(step.state.means.double(), settings.neighbours)
+        costs = pair_costs(step.state, near, settings)
+        first, second = cheapest_pairs(near, costs, most, settings.matching_passes)
+        del near, costs
+        give_back_freed_memory()
+        state, merged = replace_pairs(step.state, first, second, settings)
+        rounds = (*step.rounds, merged)
 
-    def remaining() -> Gaussians:
-        groups = Groups.of(participants, state, tree.groups(), tree.shares())
-        return scene_maker(participants, groups, settings)[1](0.0)
+        def remaining() -> Gaussians:
+            return scene_maker(participants, Groups.of(participants, state, rounds), settings)[1](0.0)
 
-    reference = step.reference or _reference(participants, viewpoints, len(state), remaining, settings)
-    return replace(step, state=state, tree=tree, reference=reference)
+        reference = step.reference or _reference(participants, step.views, len(state), remaining, settings)
+    return replace(step, state=state, rounds=rounds, reference=reference)
 
 
 def _reference(
     participants: Participants,
-    viewpoints: Viewpoints | None,
+    views: Views | None,
     count: int,
     dense: Callable[[], Gaussians],
     settings: MergeSettings,
 ) -> RendersOfSizes | None:
     """Renders of ``count`` Gaussians ``dense`` that results are compared with, in every few pixels of pictures of
-    the middle size; None if they are too many or there are no viewpoints."""
-    if viewpoints is None or count > settings.max_count_rendered or settings.finish_views < 1:
+    the middle size; None if they are too many or there are no views."""
+    if views is None or count > settings.max_count_rendered or settings.finish_views < 1:
         return None
-    views = participants.views_in_units(viewpoints.views.spread(settings.finish_views))
+    views = participants.views_in_units(views.spread(settings.finish_views))
     return RendersOfSizes(participants.in_units(dense()), views, [middle_side(views)])

@@ -68,6 +68,10 @@ def drawable(scene: Gaussians, k: int) -> Tensor:
     return chosen.nonzero()[:, 0]
 
 
+OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
+"""Tensors of a state that have a row for each Gaussian."""
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """The Gaussians that remain after some rounds.

@@ -13,8 +13,9 @@ Where traces in the scene show where its photos were taken, the weight is multip
 
 from __future__ import annotations
 
+import contextlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -32,18 +33,40 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import Views
 
 
-def visibility_weights(participants: Participants, viewpoints: Viewpoints | None, settings: MergeSettings) -> Tensor:
-    """Weights of the participants, (n,) float32, up to a common factor; 1 for all without viewpoints. In a large scene,
-    one of several participants along the curve is drawn for all of them."""
+def views_and_weights(
+    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
+) -> tuple[Views | None, Tensor]:
+    """The views that visibility is computed in, and the visibility weights (n,) of participants.
+
+    Args:
+        participants: n Gaussians.
+        views: known views, or the sampler of those that people may have taken, by default a new one.
+        settings: ``min_count_rendered``, ``sampled_views``, ``view_seed`` and those of the weights.
+
+    Returns:
+        No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
+    """
+    found, photos_found = (views if isinstance(views, Views) else None), False
+    if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:
+        sampler = views or Sampler(participants.scene)
+        with contextlib.suppress(DataError):
+            found = sampler.views(settings.sampled_views, settings.view_seed)
+            photos_found = sampler.photos is not None
+    weights = visibility_weights(participants, found, settings)
+    return found, weights * trace_factors(participants.scene, participants.members) if photos_found else weights
+
+
+def visibility_weights(participants: Participants, views: Views | None, settings: MergeSettings) -> Tensor:
+    """Weights of the participants, (n,) float32, up to a common factor; 1 for all without views. In a large scene, one
+    of several participants along the curve is drawn for all of them."""
     scene, members = participants.scene, participants.members
-    if viewpoints is None:
+    if views is None:
         return torch.ones(len(members), **FLOATS)
     step = -(-len(members) // settings.max_count_drawn)
     rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
     drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
-    weights = covered_per_area(drawn, rows, participants.views_in_units(viewpoints.views), settings)
-    weights = weights.repeat_interleave(step)[: len(members)]
-    return weights * trace_factors(scene, members) if viewpoints.photos_found else weights
+    weights = covered_per_area(drawn, rows, participants.views_in_units(views), settings)
+    return weights.repeat_interleave(step)[: len(members)]
 
 
 def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = MERGING) -> Tensor:
@@ -70,28 +93,3 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     if not 0 < float(well_seen) < math.inf:
         return torch.ones(len(ratios), **FLOATS)
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoints:
-    """Views that visibility is computed in."""
-
-    views: Views  # in scene units
-    photos_found: bool = False
-    """Whether views were sampled about where photos were taken, which traces in the scene show."""
-
-
-def sampled_viewpoints(sampler: Sampler, settings: MergeSettings) -> Viewpoints | None:
-    """Views that people may have taken, and whether traces in the scene show where.
-
-    Args:
-        sampler: of the scene.
-        settings: ``sampled_views`` and ``view_seed``.
-
-    Returns:
-        The viewpoints; None if nothing of the scene is visible, or no view is asked for.
-    """
-    try:
-        return Viewpoints(sampler.views(settings.sampled_views, settings.view_seed), sampler.photos is not None)
-    except DataError:
-        return None

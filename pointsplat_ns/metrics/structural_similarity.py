@@ -8,7 +8,6 @@ check that all agree.
 
 from __future__ import annotations
 
-import functools
 import math
 
 import torch
@@ -16,8 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import KERNELS, agreement, on_threads
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS
+from pointsplat_ns.system.kernels import KERNELS, on_threads
+from pointsplat_ns.system.tensors import DOUBLES
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels."""
@@ -126,17 +125,3 @@ def _call(
         partials=partials, sums=sums, grad=grad,
     )  # fmt: skip
     on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether the kernel gives the similarity of some images and its gradient as torch does."""
-    generator = torch.Generator().manual_seed(0)
-    image, noise = (torch.rand(1, 70, 59, 3, generator=generator, **FLOATS) for _ in range(2))
-    found = []
-    for function in (CompiledSimilarity.apply, functools.partial(mean_ssim, compiled=False)):
-        with torch.enable_grad():
-            leaf = image.clone().requires_grad_()
-            value = function(leaf.permute(0, 3, 1, 2), (0.6 * image + 0.4 * noise).permute(0, 3, 1, 2))
-        found.append((value.detach(), *torch.autograd.grad(value, leaf)))
-    return agreement(found[0], found[1], off=1e-4, share=1e-2)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, log_volume, opacity, weighted_score
+from pointsplat_ns.pruning.paper import DEFAULT_OPACITY_WEIGHT, of_usable, weighted_score
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -29,20 +28,9 @@ def authors_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIG
     )
 
 
-def log_volume_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT) -> Tensor:
-    """Eq. 3 with the logarithm of the volume in place of the volume, so that a few giants do not dominate the z-score.
-    Errors as of :func:`~pointsplat_ns.pruning.paper.paper_score`."""
-    return weighted_score(scene, opacity_weight, opacity, lambda part: _within_finite(log_volume(part)))
-
-
 def opacity_score(scene: Gaussians) -> Tensor:
     """Opacity alone: the logit, which ranks like alpha but does not saturate, (N,) float64."""
-    return _only_usable(scene, scene.opacities[:, 0].double())
-
-
-def volume_score(scene: Gaussians) -> Tensor:
-    """Volume alone: its logarithm, which ranks like the volume but does not overflow, (N,) float64."""
-    return _only_usable(scene, log_volume(scene))
+    return of_usable(scene, lambda part: part.opacities[:, 0].double())
 
 
 def log_area(scene: Gaussians) -> Tensor:
@@ -52,18 +40,10 @@ def log_area(scene: Gaussians) -> Tensor:
     return scales.sum(dim=1) - scales.amin(dim=1) if bool(scales.isfinite().all()) else scales.topk(2).values.sum(1)
 
 
-def area_score(scene: Gaussians) -> Tensor:
-    """Opacity times area: log(alpha * product of the two largest standard deviations), (N,) float64."""
-    return _only_usable(scene, F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene))
-
-
 def random_score(scene: Gaussians, seed: int = 0) -> Tensor:
     """Uniform in [0, 1), the same for a seed on every device, (N,) float64."""
     generator = torch.Generator().manual_seed(seed)
-    return _only_usable(scene, torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device))
-
-
-def _only_usable(scene: Gaussians, scores: Tensor) -> Tensor:
+    scores = torch.rand(len(scene), generator=generator, **DOUBLES).to(scene.device)
     return torch.where(scene.usable(), scores, math.nan)
 
 

@@ -14,14 +14,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
-from pointsplat_ns.pruning.baselines import (
-    area_score,
-    authors_score,
-    log_volume_score,
-    opacity_score,
-    random_score,
-    volume_score,
-)
+from pointsplat_ns.pruning.baselines import authors_score, opacity_score, random_score
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
 from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.paper import paper_score, select
@@ -34,8 +27,6 @@ class Method:
     """A pruning method."""
 
     name: str
-    summary: str
-    """Description in one clause."""
     score: Callable[..., Tensor] | None
     """Function from a scene (and views, if needed) to scores (N,), of which the highest are kept; None for merging."""
     needs_views: bool = False
@@ -47,17 +38,14 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("merge", "neighbours become one Gaussian each; by far the best", None),
-        Method("coverage", "each neighbourhood keeps its share of opacity and area", coverage_score),
-        Method("paper", "eq. 3 of the paper: opacity and volume", paper_score, weighs_opacity=True),
-        Method("authors", "the formula of the paper's released code", authors_score, weighs_opacity=True),
-        Method("opacity", "the most opaque", opacity_score),
-        Method("volume", "the largest", volume_score),
-        Method("log-volume", "eq. 3 with the logarithm of the volume", log_volume_score, weighs_opacity=True),
-        Method("area", "opacity times the area of the broad side", area_score),
-        Method("random", "any, the same ones for one seed", random_score),
-        Method("lightgaussian", "LightGaussian's global significance", lightgaussian_score, needs_views=True),
-        Method("pup", "PUP-3DGS's spatial sensitivity", pup_score, needs_views=True),
+        Method("merge", None),
+        Method("coverage", coverage_score),
+        Method("paper", paper_score, weighs_opacity=True),
+        Method("authors", authors_score, weighs_opacity=True),
+        Method("opacity", opacity_score),
+        Method("random", random_score),
+        Method("lightgaussian", lightgaussian_score, needs_views=True),
+        Method("pup", pup_score, needs_views=True),
     )
 }
 """All methods by name, the best first."""

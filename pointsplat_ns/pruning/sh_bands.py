@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
-from pointsplat_ns.pruning.baselines import area_score
+from pointsplat_ns.pruning.baselines import log_area
 
 
 def band_energies(scene: Gaussians) -> list[float]:
@@ -24,8 +25,8 @@ def band_energies(scene: Gaussians) -> list[float]:
     The mean is over all directions, over the channels, and over the Gaussians weighted by alpha times area.
     Gaussians that cannot be drawn are left out; the clamping of colours at 0 is ignored.
     """
-    weights = area_score(scene)
-    drawn = weights > -math.inf  # NaN fails too
+    weights = F.logsigmoid(scene.opacities[:, 0].double()) + log_area(scene)
+    drawn = scene.usable() & (weights > -math.inf)
     if not bool(drawn.any()):
         return [0.0] * scene.sh_degree
     weights = torch.softmax(weights[drawn], dim=0)

@@ -15,10 +15,10 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.paper import ScoreError, log_volume
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
-from pointsplat_ns.rasterizer.projection import Projected, drawn_antialiased, project
+from pointsplat_ns.rasterizer.projection import Projected, project_scene
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 
 def lightgaussian_score(
@@ -54,9 +54,9 @@ def lightgaussian_score(
         return torch.where(block.alpha > 0, block.before, 0.0).sum(-1, keepdim=True)
 
     with torch.no_grad():
-        for index in _indices(views, progress):
-            projected = _project(scene.means, scene.stds, scene, views, index)
-            through = sum_over_pixels(projected, views.width, views.height, 1, passed)[:, 0]
+        for view in _each(views, progress):
+            projected = project_scene(scene, view)
+            through = sum_over_pixels(projected, view.width, view.height, 1, passed)[:, 0]
             total.index_add_(0, projected.ids, (projected.opacities * through).double())
         if bool(usable.any()):
             logs = log_volume(scene)
@@ -99,18 +99,19 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
     _need_a_view(views)
     # In float32, small eigenvalues, and so the scores of Gaussians that few pixels show, are rounding errors. In a room
     # a quarter of the better half differed from float64.
-    scene = scene.to(torch.float64)
+    scene = scene.to(torch.float64).detach()
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
-    for index in _indices(views, progress):
+    for view in _each(views, progress):
         means, scales = (value.detach().requires_grad_() for value in (scene.means, scene.scales))
         with torch.enable_grad():
-            projected = _project(means, scales.exp(), scene, views, index)
-            colors = sh_to_color(projected.directions, scene.sh.detach()[projected.ids], scene.sh_degree)
+            projected = project_scene(scene.replace(means=means, scales=scales), view)
+            sh = scene.features_dc, scene.features_rest
+            colors = sh_to_color(projected.directions, *sh, scene.sh_degree, projected.ids)
             in_plane = torch.cat([projected.opacities.log()[:, None], projected.means2d, projected.cov2d], dim=1)
             shape = _jacobian(in_plane, means, scales, projected.ids)  # (M, 6, 6)
             color = _jacobian(colors, means, scales, projected.ids)  # (M, 3, 6)
         with torch.no_grad():
-            sums = _second_moments(projected, colors.detach(), views).double()
+            sums = _second_moments(projected, colors.detach(), view).double()
             squares, cross, weight = sums[:, :36].view(-1, 6, 6), sums[:, 36:54].view(-1, 3, 6), sums[:, 54]
             mixed = shape.mT @ cross.mT @ color
             block = shape.mT @ squares @ shape + mixed + mixed.mT + weight[:, None, None] * (color.mT @ color)
@@ -136,10 +137,10 @@ def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
     return torch.where(ok, result, -math.inf)
 
 
-def _second_moments(projected: Projected, colors: Tensor, views: Views) -> Tensor:
+def _second_moments(projected: Projected, colors: Tensor, view: View) -> Tensor:
     """(M, 55): for the gradient ``r phi`` of a channel by (log opacity, mean x, y, covariance xx, xy, yy), with r its
     gradient by log alpha, and the weight w of the colour: sums of r^2 phi phi^T, of r w phi (by channel), of w^2."""
-    background = views.background.to(colors)
+    background = view.background.to(colors)
 
     def values(block: PixelBlock) -> Tensor:
         weight = block.alpha * block.before  # (B, L, 64)
@@ -168,7 +169,7 @@ def _second_moments(projected: Projected, colors: Tensor, views: Views) -> Tenso
         squares = (phi * square[..., None, :]) @ phi.mT  # (B, L, 6, 6)
         return torch.cat([squares.flatten(-2), *cross, (weight * weight).sum(-1, keepdim=True)], dim=-1)
 
-    return sum_over_pixels(projected, views.width, views.height, 55, values)
+    return sum_over_pixels(projected, view.width, view.height, 55, values)
 
 
 def _jacobian(outputs: Tensor, means: Tensor, scales: Tensor, ids: Tensor) -> Tensor:
@@ -182,31 +183,14 @@ def _jacobian(outputs: Tensor, means: Tensor, scales: Tensor, ids: Tensor) -> Te
     return torch.stack(rows, dim=1).double()
 
 
-def _project(means: Tensor, stds: Tensor, scene: Gaussians, views: Views, index: int) -> Projected:
-    return project(
-        means,
-        scene.quats.detach(),
-        stds,
-        scene.alphas.detach(),
-        views.viewmats[index],
-        views.Ks[index],
-        views.width,
-        views.height,
-        near_plane=views.near_plane,
-        far_plane=math.inf,
-        eps2d=views.eps2d,
-        antialiased=drawn_antialiased(scene, views),
-    )
-
-
 def _need_a_view(views: Views) -> None:
     if len(views) == 0:
         raise DataError("no view to score from; expected at least one pose")
 
 
-def _indices(views: Views, progress: Callable[[float], None] | None) -> Iterator[int]:
-    """The indices of the views; calls ``progress`` after each with the share done."""
-    for index in range(len(views)):
-        yield index
+def _each(views: Views, progress: Callable[[float], None] | None) -> Iterator[View]:
+    """The views; calls ``progress`` after each with the share done."""
+    for done, view in enumerate(views, 1):
+        yield view
         if progress is not None:
-            progress((index + 1) / len(views))
+            progress(done / len(views))

@@ -6,7 +6,7 @@ multiplies the transmittance by ``1 - alpha``; a pixel is finished before the Ga
 threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
 
 Every path in torch follows the rule by calling what stands here. The compiled kernels (``blending.cpp``) write it out
-once more; they are compared with torch when they are loaded. So does ``lab/numerics/reference.py``, which checks both.
+once more, and so does ``lab/numerics/reference.py``, which checks both.
 
 Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
 """

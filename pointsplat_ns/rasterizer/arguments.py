@@ -30,7 +30,7 @@ def check_tensors(
     if c == 0:
         raise ValueError("viewmats holds no camera; expected at least one")
     shape = tuple(colors.shape) if isinstance(colors, Tensor) else _shape_together(colors, n, sh_degree)
-    channels = _check_channels(shape, n, c) if sh_degree is None else _check_harmonics(shape, n, c, sh_degree)
+    channels = _check_channels(shape, n, sh_degree is not None)
     if backgrounds is not None and tuple(backgrounds.shape) != (c, channels):
         raise ValueError(f"backgrounds has shape {tuple(backgrounds.shape)}; expected {(c, channels)}")
 
@@ -47,24 +47,14 @@ def _shape_together(colors: tuple[Tensor, Tensor], n: int, sh_degree: int | None
     return (n, 1 + shapes[1][1], 3)
 
 
-def _check_channels(shape: tuple[int, ...], n: int, c: int) -> int:
-    """The number of channels of colours that are no SH coefficients."""
-    if shape[:-1] not in ((n,), (c, n)) or shape[-1] < 1:
-        hint = "; SH coefficients need sh_degree" if shape in ((n, *shape[1:2], 3), (c, n, *shape[2:3], 3)) else ""
-        raise ValueError(f"colors has shape {shape}; expected ({n}, channels) or ({c}, {n}, channels){hint}")
+def _check_channels(shape: tuple[int, ...], n: int, harmonics: bool) -> int:
+    """The number of channels of colours, or of SH coefficients, which is 3."""
+    if harmonics and (len(shape) != 3 or shape[::2] != (n, 3)):
+        raise ValueError(f"colors has shape {shape}; expected SH coefficients ({n}, K, 3)")
+    if not harmonics and (shape[:-1] != (n,) or shape[-1] < 1):
+        hint = "; SH coefficients need sh_degree" if shape == (n, *shape[1:2], 3) else ""
+        raise ValueError(f"colors has shape {shape}; expected ({n}, channels){hint}")
     return shape[-1]
-
-
-def _check_harmonics(shape: tuple[int, ...], n: int, c: int, sh_degree: int) -> int:
-    """The number of channels of SH coefficients: three."""
-    if not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
-        raise ValueError(f"sh_degree is {sh_degree!r}; expected 0 to 3, or None")
-    needed = (sh_degree + 1) ** 2
-    if len(shape) < 3 or shape[:-2] not in ((n,), (c, n)) or shape[-1] != 3:
-        raise ValueError(f"colors has shape {shape}; expected SH coefficients ({n}, K, 3) or ({c}, {n}, K, 3)")
-    if shape[-2] < needed:
-        raise ValueError(f"colors: {shape[-2]} SH coefficients given; degree {sh_degree} needs {needed}")
-    return 3
 
 
 def check_options(width: int, height: int, near_plane: float, far_plane: float, **others: Any) -> None:

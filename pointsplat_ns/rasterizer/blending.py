@@ -32,10 +32,10 @@ def bytes_per_pair(colors: Tensor) -> int:
     return 192 * size // 4 + (colors.shape[1] - 3) * size
 
 
-def untiled(values: Tensor, region: Region, cameras: int = 1) -> Tensor:
-    """Pixels (C, H, W, D) of a region's tiles (C * rows * columns, [D,] 64)."""
-    tiles = values.view(cameras, region.rows, region.columns, -1, TILE, TILE)
-    return tiles.permute(0, 1, 4, 2, 5, 3).reshape(cameras, region.rows * TILE, region.columns * TILE, -1)
+def untiled(values: Tensor, region: Region) -> Tensor:
+    """Pixels (H, W, D) of a region's tiles (rows * columns, [D,] 64)."""
+    tiles = values.view(region.rows, region.columns, -1, TILE, TILE)
+    return tiles.permute(0, 3, 1, 4, 2).reshape(region.rows * TILE, region.columns * TILE, -1)
 
 
 class Blend(torch.autograd.Function):
@@ -88,7 +88,7 @@ def blend(
     memory_budget: int = MEMORY_BUDGET,
     absgrad_of: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Blend Gaussians into images.
+    """Blend Gaussians into an image.
 
     Args:
         seen: M projected Gaussians.
@@ -101,21 +101,20 @@ def blend(
             of means2d, (M, 2).
 
     Returns:
-        Colours (C, H, W, D) over black, and the remaining transmittance (C, H, W, 1).
+        Colours (H, W, D) over black, and the remaining transmittance (H, W, 1).
     """
-    cameras, width, height = footprints.cameras, footprints.width, footprints.height
     regions = footprints.regions(max(1, memory_budget // bytes_per_pair(colors)))
 
     def assemble(parts: list[Tensor]) -> Tensor:
         """Regions run through rows of tiles, or through the columns of one row."""
         bands, row = [], []
         for part, region in zip(parts, regions, strict=True):
-            row.append(untiled(part, region, cameras))
+            row.append(untiled(part, region))
             if region.right == footprints.columns:
-                bands.append(torch.cat(row, dim=2) if len(row) > 1 else row[0])
+                bands.append(torch.cat(row, dim=1) if len(row) > 1 else row[0])
                 row = []
-        whole = torch.cat(bands, dim=1) if len(bands) > 1 else bands[0]
-        return whole[:, :height, :width]
+        whole = torch.cat(bands) if len(bands) > 1 else bands[0]
+        return whole[: footprints.height, : footprints.width]
 
     absolute: list[Tensor] = []
 

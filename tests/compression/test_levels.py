@@ -55,12 +55,6 @@ def manifest_of(folder: Path) -> dict:
     return json.loads((folder / "lod.json").read_text("utf-8"), parse_constant=refuse)
 
 
-def test_levels_have_the_counts_that_were_asked_for_the_finest_first(scene, levels):
-    assert [len(level.scene) for level in levels] == [200, 100, 40, 12]
-    assert [len(s) for s in levels.scenes] == [200, 100, 40, 12] and len(levels) == 4
-    assert all(level.scene.sh_degree == scene.sh_degree for level in levels)
-
-
 def test_a_level_alone_is_what_prune_gives(scene, views):
     alone = ps.lod(scene, ["50%"], views=views)[0].scene
     assert same(alone, ps.prune(scene, "50%", views=views))
@@ -157,16 +151,6 @@ def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_
     }
     levels.save(tmp_path, force=True)
     assert (tmp_path / taken).read_bytes() != b"precious" and (tmp_path / "other.txt").read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("file", "levels are several files"), ("small.ply", "levels are several files; expected the name of a folder")],
-)
-def test_a_folder_that_cannot_be_one_is_refused_before_a_scene_is_read(name, message, tmp_path):
-    (tmp_path / "file").write_text("precious")
-    with pytest.raises(ps.SceneError, match=message):
-        ps.lod("not_there.ply", folder=tmp_path / name)
 
 
 @pytest.mark.parametrize(

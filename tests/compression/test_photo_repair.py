@@ -22,7 +22,7 @@ from pointsplat_ns.compression.optimiser import (
 )
 from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair, reallocated, split
 from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest
-from pointsplat_ns.errors import BudgetError, DataError, SceneError
+from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import prune
@@ -165,11 +165,6 @@ def test_a_run_is_compacted_with_its_photos(trained_walls):
     assert result.stages[-1].name == "photos" and result.photo_gain.after > 5
     with pytest.raises(BudgetError, match="expected it without photos"):
         ps.compact(config.parent, photos=True, target_db=20)
-
-
-def test_photos_of_no_run_are_asked_for(hollow_ball):
-    with pytest.raises(SceneError, match="expected the path of a run"):
-        ps.compact(hollow_ball, "50%", photos=True)
 
 
 def test_halves_lie_on_both_sides_along_the_longest_axis(hollow_ball):

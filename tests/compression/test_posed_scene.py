@@ -18,11 +18,10 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_named_views
-from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.upright import axis_named
 from pointsplat_ns.placing import run_frame
-from posing import inria, name_of, nerfstudio, write_colmap_text, written
+from posing import inria, nerfstudio, write_colmap_text, write_photos, written
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +84,6 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
         torch.testing.assert_close(found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5)
 
 
-def test_large_pictures_are_reduced(scene, views, tmp_path):
-    large = replace(views, Ks=views.Ks * torch.tensor([[50.0], [50.0], [1.0]]), width=3200, height=2400)
-    _, found = read_posed(scene, written(inria(large), tmp_path / "cameras.json"))
-    assert (found.width, found.height) == (1600, 1200)
-
-
 @pytest.mark.parametrize("nothing", [0, 3])
 def test_a_scene_of_which_nothing_is_visible_is_left_to_others(nothing, scene, views, tmp_path):
     path = written(inria(views), tmp_path / "cameras.json")
@@ -102,12 +95,6 @@ def turned_about(views: ps.Views) -> ps.Views:
     """Cameras in another frame, whose x, y and z are the scene's y, z and x."""
     turn = torch.eye(4, dtype=torch.float64)[[1, 2, 0, 3]]
     return replace(views, viewmats=views.viewmats.double() @ turn)
-
-
-def write_photos(scene: Gaussians, views: ps.Views, folder: Path) -> None:
-    folder.mkdir(parents=True)
-    for index, view in enumerate(views):
-        write_picture(ps.render(scene, view), folder / name_of(index))
 
 
 @pytest.mark.parametrize("layout", ["nerfstudio", "scannet++", "colmap"])
@@ -206,12 +193,6 @@ def test_up_is_estimated_where_it_is_not_said():
     back = ps.place(turned, up="z")
     # Estimated to half a degree; the room is 6 m wide.
     assert float((back.means[:, 2] - room.means[:, 2]).abs().max()) < 0.1
-
-
-def test_scale_changes_sizes_too():
-    scene = cloud(20, SEED)
-    larger = ps.place(scene, scale=2.0)
-    assert torch.allclose(larger.means, 2 * scene.means) and torch.allclose(larger.scales, scene.scales + math.log(2))
 
 
 def test_the_frame_of_a_run_is_undone(tmp_path):

@@ -12,8 +12,7 @@ import pointsplat_ns as ps
 from making import ball, run_of
 from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.io.pictures import write_picture
-from posing import inria, name_of, nerfstudio, write_colmap_text
+from posing import inria, nerfstudio, write_colmap_text, write_photos
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +37,6 @@ def known(path: Path, poses: str | None = None) -> ps.Views | None:
 
 def same(found: ps.Views | None, views: ps.Views) -> bool:
     return found is not None and torch.allclose(found.viewmats, views.viewmats.double(), atol=1e-5)
-
-
-def write_photos(scene, views, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, view in enumerate(views):
-        write_picture(ps.render(scene, view), folder / name_of(index))
 
 
 @pytest.mark.parametrize("place", ["point_cloud/iteration_30000/point_cloud.ply", "room.ply"])
@@ -103,21 +96,3 @@ def test_none_passes_over_the_dataset_of_a_run_too(trained_walls):
     run = run_of(trained_walls, "wall-a")
     assert read_source(run, Looking())[1].known(3) is not None
     assert read_source(run, Looking("none"))[1].known(3) is None
-
-
-def test_commands_of_a_sweep_of_sampled_views_say_so(trained_walls, tmp_path):
-    run = run_of(trained_walls, "wall-a")
-    options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
-    ps.measure_tradeoff(run, tmp_path / "out", poses="none", **options)
-    points = (tmp_path / "out" / "tradeoff.json").read_text()
-    assert f"pointsplat prune {run} " in points and "--poses none" in points and "sampled" in points
-
-
-def test_films_and_the_viewer_use_them_too(scene, views, tmp_path):
-    path = tmp_path / "room.ply"
-    ps.save(scene, path)
-    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
-    assert ps.render_path(path, tmp_path / "through", width=32, height=24) == len(views)
-    assert ps.render_path(path, tmp_path / "around", views="none", width=32, height=24, fps=10, seconds=0.3) == 3
-    with ps.open_viewer(path, port=0) as known, ps.open_viewer(path, views="none", port=0) as sampled:
-        assert known.origin == "given views" and sampled.origin != known.origin

@@ -132,15 +132,6 @@ def test_steps_draw_few_pixels_of_each_view_as_of_two_sizes(hollow_ball):
     assert len(widened) == 28 and all(found == of_both for found in widened.values())
 
 
-def test_views_are_sampled_once_and_seen_again_in_another_order(hollow_ball):
-    source = ViewSource(hollow_ball, resolution=(64, 48))
-    count = VIEW_COUNTS.stepped
-    taken = [place(view.viewmat) for view in itertools.islice(source.sampled(), 2 * count)]
-    assert len(set(taken[:count])) == count and set(taken[:count]) == set(taken[count:])
-    assert taken[:count] != taken[count:]
-    assert set(taken) != {place(view.viewmat) for view in itertools.islice(source.sampled(1), count)}
-
-
 def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_ball):
     given = sample_views(hollow_ball, 20, 48, 36)
     source = ViewSource(hollow_ball, given=given)
@@ -149,15 +140,6 @@ def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_
     taken = [place(view.viewmat) for view in itertools.islice(source.others(), 32)]
     assert len(left) == 8 and set(taken[::2]) == left
     assert len(set(taken[1::2])) == 16 and not set(taken[1::2]) & (left | compared)
-
-
-def test_views_sampled_beside_few_given_ones_have_their_background(hollow_ball):
-    few = sample_views(hollow_ball, 3, 48, 36)
-    white = type(few)(few.viewmats, few.Ks, few.width, few.height, torch.ones(3))
-    taken = list(itertools.islice(ViewSource(hollow_ball, given=white).others(), 40))
-    places = {place(view.viewmat) for view in taken}
-    assert len(places) == 40 and not places & {place(m) for m in few.viewmats}
-    assert all(view.background.tolist() == [1, 1, 1] for view in taken)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

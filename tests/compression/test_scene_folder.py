@@ -17,9 +17,6 @@ from pointsplat_ns import scene_folder
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.formats.sog import encode_sog, sog_bytes_like
-from pointsplat_ns.looking.fill import fill
-from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.scene_folder import Command, SceneTask, run_on_folder
 from pointsplat_ns.system.claims import claim
 from scene_work import halve
@@ -143,7 +140,7 @@ def test_an_interruption_ends_it_all_and_leaves_whole_files(folder):
 
 def test_processes_that_are_killed_lose_no_scene_and_make_none_twice(tmp_path):
     folder = tmp_path / "scenes"
-    names = [f"fine{i}" for i in range(6)] + [f"killed{i}" for i in range(2)] + ["bad", "deadly"]
+    names = ["fine0", "fine1", "killed", "bad", "deadly"]
     for seed, name in enumerate(names):
         write_ply(cloud(4, seed), folder / f"{name}.ply")
     shares: list[float] = []
@@ -189,15 +186,12 @@ def test_rows_that_look_wrong_are_counted():
     scene.quats[2] = 0
     scene.opacities[3] = math.inf
     scene.opacities[4] = -20.0
-    for value in scene.tensors():
-        value[5:7] = value[7]
     assert ps.info(scene).suspicious == {
         "NaN": 1,
         "infinite": 1,
         "opacity of exactly 0 or 1": 1,
         "too faint to be drawn": 1,
         "zero quaternion": 1,
-        "exact copy of another": 2,
     }
     assert ps.info(cloud(50).replace(opacities=torch.zeros(50, 1))).suspicious == {}
 
@@ -235,13 +229,3 @@ def test_the_file_its_format_and_its_size_are_named(tmp_path):
     parts = sum(part.stat().st_size for part in (tmp_path / "folder").iterdir())
     assert (found.format, found.bytes) == ("SOG folder", parts)
     assert (ps.info(scene).file, ps.info(scene).format, ps.info(scene).bytes) == ("", "", 0)
-
-
-def test_up_is_named_or_estimated_and_fill_is_that_of_the_views():
-    scene, view = ps.example_room()[::100], {"resolution": "64x48"}
-    found, named = ps.info(scene, **view), ps.info(scene, up="-y", **view)
-    assert found.up_text.startswith("z") and found.up == [0, 0, 1]
-    assert named.up_text == "-y" and not named.up_is_guess
-    views = ViewSource(scene, resolution=(64, 48), up=up_named("-y")).views(12)
-    assert named.fill == pytest.approx(fill(scene, views)) and named.fill != pytest.approx(found.fill)
-    assert named.views == f"{len(views)} views of 64 x 48 pixels"

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from making import assert_same_on_any_threads
 from pointsplat_ns.geometry import neighbours
 from pointsplat_ns.geometry.neighbours import NearestOf, nearest, other_neighbours
 from pointsplat_ns.geometry.transforms import curve_keys
@@ -45,7 +44,7 @@ def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
     assert bool(reached.all())
 
 
-@pytest.mark.parametrize("n", [1, 7, 8, 9, 64, 65, 600, 5000])
+@pytest.mark.parametrize("n", [1, 7, 600])
 def test_the_nearest_of_other_places_are_those_of_brute_force(n):
     where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
     where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
@@ -55,11 +54,6 @@ def test_the_nearest_of_other_places_are_those_of_brute_force(n):
     wanted = (queries[:, None] - where).square().sum(2).sort(dim=1).values[:, :6]
     torch.testing.assert_close(distances, wanted, rtol=1e-14, atol=0)  # float64, in another order
     assert all(len(row.unique()) == min(6, n) for row in near)
-
-
-def test_any_number_of_threads_finds_the_same_neighbours():
-    where = points(20_000).double()
-    assert_same_on_any_threads(lambda: [other_neighbours(where, 6), NearestOf(where, 3)(where)])
 
 
 def test_the_curve_interleaves_the_bits_of_the_grid():

@@ -14,7 +14,7 @@ from pointsplat_ns.looking import sampling
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.rasterizer import pixels_of, render, render_depth
+from pointsplat_ns.rasterizer import pixels_of, render
 
 
 def places_of(views):
@@ -30,14 +30,6 @@ def test_sampled_poses_are_rotations_and_show_the_scene(hollow_ball):
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3).double().expand(12, 3, 3), atol=1e-12)
     assert torch.allclose(torch.linalg.det(rotation), torch.ones(12).double(), atol=1e-12)
     assert all(render(hollow_ball, views[i]).mean() > 0.02 for i in range(12))
-
-
-def test_an_object_is_looked_at_from_around_it(make_hollow_ball):
-    generator = torch.Generator().manual_seed(3)
-    blob = make_hollow_ball(400).replace(means=0.3 * torch.randn(400, 3, generator=generator))
-    views = sample_views(blob, 4, 64, 48)
-    assert (places_of(views).norm(dim=1) > 0.3).all()
-    assert all(render(blob, views[i]).max() > 0.2 for i in range(len(views)))
 
 
 @pytest.mark.parametrize(
@@ -129,15 +121,6 @@ def test_views_do_not_depend_on_the_unit_of_length(make, factor):
     # 1e-3: float32 positions round otherwise at another scale
     assert torch.allclose(places_of(one) * factor, places_of(two), rtol=1e-3, atol=1e-3 * factor)
     assert torch.allclose(render(scene, one), render(other, two), atol=0.02)
-
-
-def test_nothing_nearer_than_the_near_plane_is_drawn(hollow_ball):
-    hollow_ball = hollow_ball[1:]  # without the outlier
-    views = sample_views(hollow_ball, 1, 32, 24)
-    beyond = dataclasses.replace(views, near_plane=1e5)
-    assert render(hollow_ball, views).max() > 0 and render(hollow_ball, beyond).max() == 0
-    assert beyond[0].near_plane == beyond.resized(8).near_plane == beyond[[0]].near_plane == 1e5
-    assert render_depth(hollow_ball, views[0])[1].max() > 0 and render_depth(hollow_ball, beyond[0])[1].max() == 0
 
 
 def test_a_view_that_a_few_large_gaussians_fill_is_not_taken(make_hollow_ball):

@@ -1,13 +1,12 @@
 """Traces of photos, and where views come from."""
 
-import dataclasses
 import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from making import EYES, ball, box_room, normal_scene, photographed, run_of
+from making import EYES, ball, normal_scene, photographed, run_of
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
@@ -15,7 +14,6 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, correlation, photo_places, trace_factors
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.merging import merge
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
@@ -91,7 +89,7 @@ def test_no_place_is_sure_in_scenes_without_evidence(scene):
     assert not sure_of_photos(scene)
 
 
-@pytest.mark.parametrize("factor", [1e-30, 1e3, 1e38])
+@pytest.mark.parametrize("factor", [1e-30, 1e38])
 def test_photo_places_are_found_from_sh_of_any_length_but_zero(factor):
     scene = photographed()
     large = scene.replace(features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float())
@@ -151,16 +149,6 @@ def test_extremes_stay_within_bounds(dtype):
         assert float(factors.log().abs().max()) <= LOOKING.max_log_factor + 1e-5
 
 
-def test_merging_keeps_more_where_trace_factors_are_large():
-    """The second half has the same shape, but no photo showed it."""
-    first = photographed(1100)
-    second = first.replace(means=first.means + 5.0, features_rest=torch.zeros_like(first.features_rest))
-    scene = Gaussians(*(torch.cat(pair) for pair in zip(first.tensors(), second.tensors(), strict=True)))
-    assert sure_of_photos(scene)
-    near = torch.cdist(merge(scene, 400).scene.means, torch.stack([torch.zeros(3), torch.full((3,), 5.0)])).argmin(1)
-    assert int((near == 0).sum()) > 270
-
-
 def test_views_are_sampled_where_photos_were_taken():
     """A smooth shell around photos that were all taken from about one place."""
     shell = ball(3000, 3, log_size=math.log(0.12), opacity=5.0)
@@ -208,13 +196,6 @@ def test_a_run_whose_data_is_gone_is_looked_at_from_sampled_poses(scene, trained
     assert source.origin == f"sampled poses, up is {source.up} (no dataset: its data is not there)"
 
 
-def test_a_run_without_data_whose_scene_shows_nothing_has_no_views(scene, trained_walls):
-    nothing = ViewSource(scene[:0], run=run_of(trained_walls, "wall-a"), dataset_views=data_is_gone)
-    with pytest.raises(DataError, match="nothing of the scene can be seen"):
-        nothing.views(2)
-    assert nothing.origin == ""
-
-
 def test_a_resolution_is_that_of_sampled_views_and_bounds_given_ones(scene):
     asked = ViewSource(scene, resolution=(96, 54)).views(2)
     assert (asked.width, asked.height) == (96, 54)
@@ -227,22 +208,6 @@ def test_a_scene_without_known_views_is_repaired_on_two_backgrounds(scene):
     views = ViewSource(scene, resolution=(64, 48)).others()
     behind = [next(views).background.tolist() for _ in range(10)]
     assert behind.count([1.0, 1.0, 1.0]) == 2 and behind.count([0.0, 0.0, 0.0]) == 8
-
-
-def test_views_sampled_beside_few_known_ones_have_their_mode(scene):
-    given = dataclasses.replace(sample_views(scene, 2, 64, 48), rasterize_mode="antialiased")
-    assert next(ViewSource(scene, given=given).others()).rasterize_mode == "antialiased"
-
-
-def test_traces_of_photos_are_looked_for_once(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        "pointsplat_ns.looking.sampling.photo_places", lambda *of: asked.append(of) or photo_places(*of)
-    )
-    source = ViewSource(box_room(0))
-    assert len(source.views(3)) and len(source.compared()) and source.sampler.up
-    assert source.origin.startswith("sampled poses, up is ")
-    assert len(asked) == 1  # it takes a second
 
 
 def test_given_views_go_before_all_others(scene, trained_walls):

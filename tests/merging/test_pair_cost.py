@@ -157,12 +157,6 @@ def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
         assert float(kernels.quantile(share)) < times * float(torchs.quantile(share))
 
 
-@needs_compiler
-def test_any_number_of_threads_gives_the_same_costs():
-    state, others = state_of(cloud(9000)), (torch.arange(9000)[:, None] + torch.arange(1, 7)) % 9000
-    assert_same_on_any_threads(lambda: [pair_costs(state, others.to(torch.int32))])
-
-
 def test_float32_costs_rank_pairs_as_float64_does():
     """Needles 1000 times as long as thick, which float32 cannot tell from lines without a floor on their width."""
     g = torch.Generator().manual_seed(1)

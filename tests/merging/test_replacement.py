@@ -1,6 +1,5 @@
 """Pairs, what they become, and members that change their group."""
 
-import dataclasses
 import math
 
 import pytest
@@ -43,11 +42,12 @@ def test_a_replacement_has_the_moments_of_its_pair_and_is_finite():
     """Moments by mass, opacity times area; of pairs so faint that the area does not grow."""
     scene = cloud(40).replace(opacities=torch.full((40, 1), -3.0))
     state, pairs = state_of(scene), torch.randperm(40)[:30].view(2, 15)
-    after, shares = replace_pairs(state, *pairs, MERGING)
-    rows = (torch.ones(40, dtype=torch.bool).index_fill(0, pairs[1], False).cumsum(0) - 1)[pairs[0]]
+    after, merged = replace_pairs(state, *pairs, MERGING)
+    rows = merged.place[pairs[0]]
+    assert torch.equal(rows, merged.place[pairs[1]]) and len(merged.place.unique()) == 25
     mass = (state.alphas * rms_area(state.cov.double()))[pairs]
     w = mass / mass.sum(0)
-    torch.testing.assert_close(shares, w[0].float())
+    torch.testing.assert_close(merged.shares[pairs], w.float())
     mean = (w[:, :, None] * state.means[pairs]).sum(0)
     apart = state.means[pairs] - mean
     spread = unpack(state.cov.double()[pairs.flatten()]).view(2, 15, 3, 3) + apart[..., None] * apart[..., None, :]
@@ -72,25 +72,13 @@ def test_a_state_in_float32_becomes_what_one_in_float64_becomes(scene):
         state, shares = initial_state(everyone, torch.ones(2000), dtype=dtype), []
         for _ in range(4):
             pairs = torch.arange(len(state)).view(2, -1)
-            state, share = replace_pairs(state, *pairs, MERGING)
-            shares.append(share)
+            state, merged = replace_pairs(state, *pairs, MERGING)
+            shares.append(merged.shares)
         found.append((state.means, state.cov, state.alphas, torch.cat(shares)))
     for single, double in zip(*found, strict=True):
         largest = double.abs().reshape(len(double), -1).amax(1)
         apart = (single.double() - double).abs().reshape(len(double), -1).amax(1) / largest.clamp_min(1e-3)
         assert float(apart.quantile(0.98)) < 1e-3  # areas of needles, of which float32 loses the width, are the others
-
-
-def test_any_number_of_threads_gives_the_same_and_others_stay_as_they_are():
-    state, pairs = state_of(cloud(9000)), torch.arange(6000).view(2, 3000)
-
-    def replaced() -> list[torch.Tensor]:
-        after, shares = replace_pairs(state, *pairs, MERGING)
-        return [*(value for value in dataclasses.astuple(after) if isinstance(value, torch.Tensor)), shares]
-
-    assert_same_on_any_threads(replaced)
-    after, _ = replace_pairs(state, *pairs, MERGING)
-    assert torch.equal(after.cov[3000:], state.cov[6000:]) and torch.equal(after.colours[3000:], state.colours[6000:])
 
 
 def ring(n: int) -> torch.Tensor:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, cloud, normal_scene, photographed
+from making import ball, normal_scene, photographed
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
@@ -16,9 +16,8 @@ from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
 from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.merging.visibility import (
-    Viewpoints,
     covered_per_area,
-    sampled_viewpoints,
+    views_and_weights,
     visibility_weights,
 )
 from pointsplat_ns.views import Views
@@ -44,13 +43,9 @@ def wall(z: float, rows: int = 32, size: float = 2.0) -> Gaussians:
     )
 
 
-def joined(*scenes: Gaussians) -> Gaussians:
-    return Gaussians(*(torch.cat(values) for values in zip(*(scene.tensors() for scene in scenes), strict=True)))
-
-
 def two_walls() -> Gaussians:
     """Two walls, one behind the other, alike to the last digit in all else."""
-    return joined(wall(-0.5), wall(0.5))
+    return Gaussians.cat([wall(-0.5), wall(0.5)])
 
 
 def weights_of(scene: Gaussians, views: Views) -> torch.Tensor:
@@ -62,7 +57,7 @@ def aside(scene: Gaussians, x: float) -> Gaussians:
 
 
 def test_weights_fall_with_the_square_of_the_distance():
-    near, far = weights_of(joined(aside(wall(0), -1.2), aside(wall(4), 1.2)), of_origin((0, 0, -4))).chunk(2)
+    near, far = weights_of(Gaussians.cat([aside(wall(0), -1.2), aside(wall(4), 1.2)]), of_origin((0, 0, -4))).chunk(2)
     assert float(near.median() / far.median()) == pytest.approx(4, rel=0.1)
 
 
@@ -70,7 +65,7 @@ def test_weights_fall_with_the_square_of_the_distance():
 def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel(rows):
     """Of 256 in a row, each is 0.2 pixels large. Widened by 0.3 pixels, it would weigh ten times as much."""
     coarse, fine = aside(wall(0, rows=16), -1.2), aside(wall(0, rows=rows), 1.2)
-    found = weights_of(joined(coarse, fine), of_origin((0, 0, -4)))
+    found = weights_of(Gaussians.cat([coarse, fine]), of_origin((0, 0, -4)))
     assert 0.5 < float(found[256:].median() / found[:256].median()) < 2
 
 
@@ -79,12 +74,12 @@ def test_an_occluded_gaussian_has_a_small_weight():
     assert front.dtype == torch.float32 and float(back.median()) < 0.1 * float(front.median())
 
 
-@pytest.mark.parametrize("max_count", [2048, 700, 3])  # of more, some are drawn for all
+@pytest.mark.parametrize("max_count", [700, 3])  # of more, some are drawn for all
 def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
     scene = two_walls()
     participants = Participants.of(scene, torch.arange(len(scene)))
-    viewpoints = Viewpoints(views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size))
-    found = visibility_weights(participants, viewpoints, replace(MERGING, max_count_drawn=max_count))
+    views = views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size)
+    found = visibility_weights(participants, views, replace(MERGING, max_count_drawn=max_count))
     assert found.shape == (len(scene),)
     front = scene.means[participants.members, 2] < 0
     if max_count > 3:
@@ -109,25 +104,15 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
         assert found.tolist() == [1.0] * 400
 
 
-@pytest.mark.parametrize("found_photos", [True, False])
-def test_traces_count_where_the_scene_tells_of_its_photos(monkeypatch, found_photos):
-    monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, views, settings: torch.full((30,), 0.5))
-    monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((30,), 16.0))
-    viewpoints = Viewpoints(of_origin((0, -6, 1)), photos_found=found_photos)
-    found = visibility_weights(Participants.of(cloud(30), torch.arange(30)), viewpoints, MERGING)
-    assert found.tolist() == [8.0 if found_photos else 0.5] * 30
-
-
-def test_without_a_free_place_there_are_no_viewpoints():
-    fog = ball(200)
-    fog = fog.replace(opacities=torch.full((200, 1), -math.inf))
-    assert sampled_viewpoints(Sampler(fog, (32, 24)), MERGING) is None
-
-
-def test_sampled_viewpoints_say_whether_photo_places_are_sure():
-    settings = replace(MERGING, sampled_views=2)
-    for scene, found in ((photographed(), True), (ball(500, 0), False)):
-        assert sampled_viewpoints(Sampler(scene, (32, 24)), settings).photos_found == found
+def test_traces_count_where_the_scene_tells_of_its_photos_and_fog_has_no_views(monkeypatch):
+    monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, *_: torch.full((len(rows),), 0.5))
+    monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0))
+    settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
+    fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
+    for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):
+        participants = Participants.of(scene, torch.arange(len(scene)))
+        views, weights = views_and_weights(participants, Sampler(scene, (32, 24)), settings)
+        assert weights.tolist() == [weight] * len(scene) and (views is None) == (scene is fog)
 
 
 @pytest.mark.parametrize(
@@ -142,16 +127,14 @@ def test_sampled_viewpoints_say_whether_photo_places_are_sure():
         pytest.param((0.0, 1.0, 2.0), [0.0, 0.0, 2.0], 0.5, 2.0, id="level, then rising"),
         # A flower scene gained 1.3 dB at each step, more at each, and stopped 0.8 dB short of what it could have.
         pytest.param((0.0, 1.0, 2.0), [0.0, 1.0, 2.0], 0.5, 2.5, id="rising evenly"),
-        pytest.param((0.0, 1.0, 2.0), [0.0, 1.0, 3.0], 0.5, 2.5, id="rising ever faster"),
         pytest.param((0.0, 1.0, 2.0), [3.0, 1.0, 0.0], 0.5, -0.5, id="falling ever slower"),
-        pytest.param((0.0, 1.0, 2.0), [2.0, 1.0, 0.0], 0.5, -0.5, id="falling evenly"),
     ],
 )
 def test_the_top_of_a_parabola_within_margins_or_else_the_best_trial(at, values, margin, want):
     assert top_of_parabola(at, values, margin) == pytest.approx(want)
 
 
-@pytest.mark.parametrize("change", [-0.08, -0.04, 0.03, 0.0])
+@pytest.mark.parametrize("change", [-0.08, 0.03])
 def test_the_size_change_that_undoes_a_known_one_is_found(change):
     dense = ball(500)
     reference = RendersOfSizes(dense, sample_views(dense, 3, width=96, height=72), sides_of(96, 72))

@@ -98,7 +98,7 @@ def test_a_scene_with_no_gaussian_or_none_that_can_be_drawn_is_refused(by):
         ("best", {}, UNKNOWN),
         *((by, {"views": None}, f"{by} looks at the scene from poses; expected views") for by in WITH_VIEWS),
         *(
-            (by, {"opacity_weight": 0.5}, f"{by} does not weigh opacity; .* one of paper, authors, log-volume$")
+            (by, {"opacity_weight": 0.5}, f"{by} does not weigh opacity; .* one of paper, authors$")
             for by in WITHOUT_OPACITY_WEIGHT
         ),
     ],
@@ -126,7 +126,7 @@ def test_settings_prune_as_prune_does(keep, count):
         ),
         *(({"by": by}, f"{by} looks at a scene from poses; expected a method that needs none") for by in WITH_VIEWS),
         ({"by": "best"}, UNKNOWN),
-        ({"opacity_weight": 0.5}, "merge does not weigh opacity; .* one of paper, authors, log-volume$"),
+        ({"opacity_weight": 0.5}, "merge does not weigh opacity; .* one of paper, authors$"),
     ],
 )
 def test_settings_refuse_what_fits_no_scene_and_methods_that_need_views(options, message):

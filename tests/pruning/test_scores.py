@@ -30,10 +30,7 @@ def exactly(scene):
 FORMULAS = {
     "paper": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
     "authors": lambda w, alpha, s, logit, log_s: w * z(logit) + (1 - w) * z((log_s + np.longdouble(1e-6)).prod(1)),
-    "log-volume": lambda w, alpha, s, *_: w * z(alpha) + (1 - w) * z(np.log(s.prod(1))),
     "opacity": lambda w, alpha, s, logit, *_: logit,
-    "volume": lambda w, alpha, s, *_: np.log(np.longdouble(4 / 3 * math.pi) * s.prod(1)),
-    "area": lambda w, alpha, s, *_: np.log(alpha * np.sort(s, 1)[:, 1:].prod(1)),
 }
 """Scores as printed, from a weight of opacity and what :func:`exactly` gives."""
 
@@ -50,13 +47,6 @@ def test_a_score_is_its_formula_with_the_papers_weight_by_default(name, weight, 
     assert torch.allclose(
         SCORES[name](scene, **options), torch.from_numpy(wanted.astype(np.float64)), rtol=1e-12, atol=1e-12
     )
-
-
-def test_authors_rank_a_pancake_above_a_ball_and_the_paper_below():
-    scales = torch.log(torch.tensor([[0.1, 0.1, 1e-5], [0.01, 0.01, 0.01], [0.02, 0.02, 0.02]]))
-    scene = normal_scene(3, 1).replace(scales=scales, opacities=torch.zeros(3, 1))
-    volume, product = SCORES["paper"](scene), SCORES["authors"](scene)
-    assert volume[2] > volume[1] > volume[0] and product[0] > product[1]
 
 
 @pytest.mark.parametrize("name", sorted(SCORES))
@@ -76,12 +66,6 @@ def test_every_score_is_float64_and_takes_an_empty_scene(name):
     assert SCORES[name](Gaussians.empty()).shape == (0,)
     only_bad = normal_scene(2, 1).map(lambda value: value * math.nan)
     assert SCORES[name](only_bad).isnan().all()
-
-
-def test_random_is_the_same_for_one_seed_and_another_for_the_next():
-    scene = normal_scene(50, 1)
-    assert torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=3))
-    assert not torch.equal(SCORES["random"](scene, seed=3), SCORES["random"](scene, seed=4))
 
 
 @pytest.mark.parametrize("name", sorted(SCORES))
@@ -107,7 +91,7 @@ def test_no_score_of_what_can_be_drawn_is_nan(name, case):
     assert len(prune(scene, 7, name)) == 7
 
 
-@pytest.mark.parametrize("name", ["paper", "authors", "opacity", "area", "log-volume"])
+@pytest.mark.parametrize("name", ["paper", "authors", "opacity"])
 def test_infinite_logits_keep_their_rank(name):
     scene = normal_scene(9, 1)
     logits = torch.linspace(-3, 3, 9)[:, None]
@@ -197,6 +181,6 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     scene = scene_at(torch.cat([big, small]), scales, logits)
     cell = (scene.means[:, 0] > 0.5) * 16 + (scene.means[:, 1] * 4).long().clamp_max(3) * 4
     cell = cell + (scene.means[:, 2] * 4).long().clamp_max(3)
-    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper", "area", "opacity")}
+    kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper")}
     regions = {by: len(cell[indices].unique()) for by, indices in kept.items()}
-    assert regions["coverage"] == 32 and max(regions["paper"], regions["area"]) < 20
+    assert regions["coverage"] == 32 and regions["paper"] < 20

@@ -82,11 +82,10 @@ def inputs(stored=17, n=500, m=300):
     return directions.double(), coefficients.double(), torch.randperm(n, generator=g)[:m]
 
 
-def colored(directions, coefficients, ids, degree, dtype, compiled, apart=False):
+def colored(directions, coefficients, ids, degree, dtype, compiled):
     """Colours, and the gradients of a fixed sum of them, in float64; those of directions by unit of their length."""
     leaves = [t.to(dtype, copy=True).requires_grad_() for t in (directions, coefficients)]
-    given = (leaves[1][:, 0], leaves[1][:, 1:]) if apart else leaves[1]
-    colors = sh_to_color(leaves[0], given, degree, ids, compiled)
+    colors = sh_to_color(leaves[0], leaves[1][:, 0], leaves[1][:, 1:], degree, ids, compiled)
     weights = torch.randn(colors.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
     grads = torch.autograd.grad((colors * weights).sum(), leaves, allow_unused=True)
     of_directions = None if grads[0] is None else grads[0].double() * directions.norm(dim=1, keepdim=True)
@@ -110,14 +109,6 @@ def test_colours_and_gradients_are_those_of_torch_and_as_near_to_float64(degree,
     assert not ours[2][rest].any() and not ours[2][:, (degree + 1) ** 2 :].any()
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-@pytest.mark.parametrize("degree", range(4))
-def test_coefficients_apart_give_the_bits_of_those_together(degree, compiled):
-    given = inputs(stored=(degree + 1) ** 2 + 1)
-    for together, apart in zip(*(colored(*given, degree, F32, compiled, how) for how in (False, True)), strict=True):
-        assert (together is apart is None) if together is None else torch.equal(together, apart)
-
-
 @needs_compiler
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_a_colour_that_is_not_finite_is_nan_and_no_other(wrong):
@@ -135,17 +126,17 @@ def test_a_colour_that_is_not_finite_is_nan_and_no_other(wrong):
 @needs_compiler
 def test_rows_of_no_gaussian_are_refused_before_memory_is_read():
     directions, coefficients, ids = (t.float() if t.is_floating_point() else t for t in inputs())
-    assert sh_to_color(directions[:0], coefficients, 3, ids[:0]).shape == (0, 3)
+    assert sh_to_color(directions[:0], coefficients[:, 0], coefficients[:, 1:], 3, ids[:0]).shape == (0, 3)
     for wrong in (-1, len(coefficients)):
         with pytest.raises(IndexError, match=f"ids are from .*{wrong}.*expected rows of 500 Gaussians"):
-            sh_to_color(directions[:2], coefficients, 3, torch.tensor([3, wrong]))
+            sh_to_color(directions[:2], coefficients[:, 0], coefficients[:, 1:], 3, torch.tensor([3, wrong]))
 
 
 # Tiles
 
 
-def footprints(cameras, compiled, count=6000, size=(203, 149)):
-    """Of Gaussians in and around images, from points to needles and some larger than an image, some too faint to
+def footprints(compiled, count=6000, size=(203, 149)):
+    """Of Gaussians in and around an image, from points to needles and some larger than an image, some too faint to
     draw."""
     g = torch.Generator().manual_seed(1)
     means2d = torch.rand(6000, 2, generator=g) * 400 - 100
@@ -156,17 +147,15 @@ def footprints(cameras, compiled, count=6000, size=(203, 149)):
     values = [means2d, cov2d, xx * yy * (1 - share * share), opacities, depths]
     names = ("means2d", "cov2d", "det", "opacities", "depth_keys")
     seen = SimpleNamespace(**{name: value[:count] for name, value in zip(names, values, strict=True)})
-    camera_ids = torch.randint(cameras, (6000,), generator=g)[:count]
-    return Footprints(seen, camera_ids, cameras, *size, compiled=compiled)
+    return Footprints(seen, *size, compiled=compiled)
 
 
 REGIONS = (Region(0, 19, 0, 26), Region(3, 4, 0, 26), Region(5, 6, 7, 8), Region(18, 19, 25, 26))
 
 
 @needs_compiler
-@pytest.mark.parametrize("cameras", [1, 2])
-def test_pairs_are_those_of_torch(cameras):
-    ours, torchs = (footprints(cameras, compiled) for compiled in (True, False))
+def test_pairs_are_those_of_torch():
+    ours, torchs = (footprints(compiled) for compiled in (True, False))
     assert ours.whole == torchs.whole == REGIONS[0]
     assert ours.regions(5000) == torchs.regions(5000) and len(ours.regions(5000)) > 3
     for region in REGIONS:
@@ -174,10 +163,3 @@ def test_pairs_are_those_of_torch(cameras):
         assert len(theirs.gaussians) > 0
         for name in ("gaussians", "offsets", "places", "counts", "order"):
             assert torch.equal(getattr(mine, name), getattr(theirs, name)), (region, name)
-
-
-@needs_compiler
-def test_no_gaussian_gives_no_pair():
-    empty = footprints(2, True, count=0)
-    tiles = empty.tiles(empty.whole)
-    assert len(tiles.gaussians) == len(tiles.counts) == 0 and not tiles.offsets.any()

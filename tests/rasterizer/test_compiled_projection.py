@@ -1,4 +1,4 @@
-"""Compiled kernels project what torch projects, with the same gradients, from ordinary scenes to degenerate ones."""
+"""Compiled kernels project what torch projects, with the same gradients."""
 
 import math
 
@@ -22,27 +22,6 @@ def scene_of(n=400, scale=-2.0, **options):
     the view, which stays in float64."""
     *scene, _ = splats_in_view(n, seed=7, scale=scale, **options)
     return [t.float().double() for t in (*scene, *camera_askew())]
-
-
-def _far_from_the_origin(means, quats, scales, opacities, view, K):
-    shift = torch.tensor([1e6, -7e5, 4e5], dtype=F64)
-    means.mul_(64).add_(shift).copy_(means.float())
-    scales.mul_(64)
-    view[:3, 3] = view[:3, 3] * 64 - view[:3, :3] @ shift
-
-
-def _in_units_of(size):
-    def change(means, quats, scales, opacities, view, K):
-        means.mul_(size).copy_(means.float())
-        scales.mul_(size).copy_(scales.float())
-        view[:3, 3] *= size
-
-    return change
-
-
-def _needles(means, quats, scales, *_):
-    scales[:, 0], scales[:, 1:] = 2.0, 2e-6
-    scales.copy_(scales.float())
 
 
 def _meaningless(means, quats, scales, opacities, *_):
@@ -69,44 +48,18 @@ def _behind_and_inside(means, quats, scales, opacities, view, K):
     scales[::3] *= 1e3
 
 
-def _longer_than_any_image(means, quats, scales, *_):
-    scales[::2, 0] = 1e12
-    scales[::5] = 1e20
-    scales.copy_(scales.float())
-
-
-def _opacities(means, quats, scales, opacities, *_):
-    opacities[:50], opacities[50:100], opacities[100:150] = 0, 1, 3
-    opacities[150:200] = torch.tensor(1 / 255).double()
-
-
-def _any_length(means, quats, *_):
-    quats.mul_(10.0 ** torch.linspace(-44, 37, len(quats), dtype=F64)[:, None]).copy_(quats.float())
-
-
 def _nothing(*_):
     pass
 
 
-# what changes a scene, in place, and options of the projection
+# What changes a scene, in place, and options of the projection. Whole pictures at more extremes: test_extremes.py.
 CASES = {
     "ordinary": (_nothing, {}),
-    "antialiased": (_nothing, {"antialiased": True}),
     "points, antialiased": (lambda m, q, s, o, *_: (s.mul_(1e-3), o.mul_(300)), {"antialiased": True}),
     "large, antialiased": (lambda m, q, s, *_: s.mul_(300), {"antialiased": True}),
-    "far from the origin": (_far_from_the_origin, {}),
-    "units of 1e-9": (_in_units_of(1e-9), {"near_plane": 1e-11}),
-    "units of 1e12": (_in_units_of(1e12), {"far_plane": math.inf}),
-    "needles": (_needles, {}),
-    "points": (lambda m, q, s, *_: s.zero_(), {}),
-    "zero quaternions": (lambda m, q, *_: q[::2].zero_(), {}),
-    "quaternions of any length": (_any_length, {}),
     "without meaning": (_meaningless, {}),
     "behind, and around the camera": (_behind_and_inside, {}),
     "at the near plane": (_at_the_near_plane, {"near_plane": 0.25}),
-    "longer than any image": (_longer_than_any_image, {}),
-    "opacities": (_opacities, {}),
-    "principal point outside": (lambda m, q, s, o, view, K: K[0, 2].fill_(-30.0), {}),
     "a mirror": (lambda m, q, s, o, view, K: K[0, 0].neg_(), {}),
     "small ones left out": (_nothing, {"radius_clip": 6.0}),
     "far ones left out": (_nothing, {"far_plane": 3.0}),
@@ -178,30 +131,14 @@ def test_projections_and_gradients_are_those_of_torch(name):
     results = [values_and_gradients(leaves, seen, common, sizes) for leaves, seen in (ours, torchs, exact)]
 
     names = [*OUTPUTS, *(f"gradient of {part}" for part in NAMES)]
-    bounded_otherwise = name == "longer than any image"  # float64 draws longer axes
     for what, mine, theirs, right in zip(names, *([*values, *grads] for values, grads in results), strict=True):
         assert mine.isfinite().all(), what
         # ten times what was seen: float32 in another order
         assert off(mine, theirs)[0] <= 5e-6 and off(mine, theirs)[1] <= 5e-6, (what, off(mine, theirs))
         for error, torchs_error in zip(off(mine, right), off(theirs, right), strict=True):
-            assert bounded_otherwise or error <= 2 * torchs_error + 1e-6, (what, error, torchs_error)
+            assert error <= 2 * torchs_error + 1e-6, (what, error, torchs_error)
     one, other = (seen.select(torch.searchsorted(seen.ids, common)) for _, seen in (ours, torchs))
     assert ((one.radii - other.radii).abs() <= 1 + 1e-6 * other.radii).all()  # rounded up
     assert off(one.depth_keys, other.depth_keys)[0] <= 1e-6
     dropped = torch.ones(len(scene[0]), dtype=torch.bool).index_fill_(0, common, False)
     assert not any(grad[dropped].any() for grad in results[0][1][:4])
-
-
-@needs_compiler
-@pytest.mark.parametrize("count", [0, 1, 9, 60])
-def test_where_no_gaussian_is_seen_gradients_are_zero(count):
-    scene = scene_of(60)
-    scene[0][:, 2] = -scene[0][:, 2].abs() - 1
-    scene[:4] = [t[:count] for t in scene[:4]]
-    leaves, seen = projected(scene, {}, F32, True)
-    assert [tuple(t.shape) for t in vars(seen).values()] == [
-        (0,), (0, 2), (0,), (0, 3), (0,), (0,), (0, 3), (0,), (0,)
-    ]  # fmt: skip
-    assert (seen.ids.dtype, seen.radii.dtype, seen.depth_keys.dtype) == (torch.int64, torch.int32, F32)
-    grads = torch.autograd.grad(seen.means2d.sum() + seen.det.sum(), leaves)
-    assert [g.shape for g in grads] == [leaf.shape for leaf in leaves] and not any(g.any() for g in grads)

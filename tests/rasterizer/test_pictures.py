@@ -130,25 +130,6 @@ def test_pictures_are_the_same_on_any_threads():
 
 
 @needs_compiler
-@torch.no_grad()
-def test_long_lists_of_a_tile_are_in_the_order_of_depth_then_row():
-    count = 2000
-    g = torch.Generator().manual_seed(4)
-    scene = normal_scene(count, 0, seed=4)
-    means = torch.zeros(count, 3)
-    means[:, 2] = torch.randint(1, 300, (count,), generator=g) / 50
-    scene = scene.replace(means=means, scales=torch.full((count, 3), -3.0), opacities=torch.full((count, 1), -4.0))
-    camera = drawing._camera(scene, view_of())
-    found = pictures._placed(scene, camera, True, drawing.QUALITIES["exact"], 10**6)
-    _, pairs, offsets, _ = found
-    wanted = means[:, 2].sort(stable=True).indices
-    lengths = offsets.diff()
-    longest = int(lengths.argmax())
-    assert int(lengths.max()) == count
-    assert torch.equal(pairs[offsets[longest] : offsets[longest + 1]], wanted)
-
-
-@needs_compiler
 def test_gradients_and_other_precisions_are_left_to_the_general_way():
     scene, view = scene_of(1, 50), view_of()
     leaf = scene.replace(features_dc=scene.features_dc.clone().requires_grad_())

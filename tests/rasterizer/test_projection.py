@@ -74,13 +74,13 @@ def test_colours_and_their_gradients_are_gsplats(degree, stored):
     theirs = gsplat_formulas()
     if stored < (degree + 1) ** 2:
         with pytest.raises(ValueError, match=f"{stored} SH coefficients given"):
-            sh_to_color(torch.zeros(2, 3), torch.zeros(2, stored, 3), degree)
+            sh_to_color(torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, stored - 1, 3), degree, torch.arange(2))
         return
     g = torch.Generator().manual_seed(degree)
     directions = (4 * torch.randn(5000, 3, generator=g, dtype=F64)).requires_grad_()
     coefficients = torch.randn(6000, stored, 3, generator=g, dtype=F64).requires_grad_()
     ids = torch.randperm(6000, generator=g)[:5000].sort().values
-    got = sh_to_color(directions, coefficients, degree, ids)
+    got = sh_to_color(directions, coefficients[:, 0], coefficients[:, 1:], degree, ids)
     want = (theirs._spherical_harmonics(degree, directions, coefficients[ids]) + 0.5).clamp_min(0)
     assert (got == 0).any() and (got - want).abs().max() < 1e-13
     (weights,) = random_like([want])

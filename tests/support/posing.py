@@ -4,7 +4,10 @@ import json
 import struct
 from pathlib import Path
 
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid, quaternions_of, viewmats_to_opengl
+from pointsplat_ns.io.pictures import write_picture
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
 
@@ -76,6 +79,14 @@ def write_colmap_binary(views: Views, folder: Path, model: int = 1, extra: tuple
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in zip(("cameras.bin", "images.bin"), colmap_binary(views, model, extra), strict=True):
         (folder / name).write_bytes(data)
+    return folder
+
+
+def write_photos(scene: Gaussians, views: Views, folder: Path) -> Path:
+    """Renders of a scene as photos, by the names of :func:`name_of`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, view in enumerate(views):
+        write_picture(render(scene, view), folder / name_of(index))
     return folder
 
 

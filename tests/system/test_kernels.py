@@ -15,19 +15,7 @@ import torch
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system import kernels
 from pointsplat_ns.system.cores import cores, cpu_quota
-from pointsplat_ns.system.kernels import agreement
 from pointsplat_ns.system.threads import fixed_threads
-
-
-@pytest.mark.parametrize("wrong", [2.0, float("nan"), float("inf")])
-def test_tensors_agree_up_to_a_share_of_numbers_that_are_off_or_not_finite(wrong):
-    right = torch.linspace(-1, 1, 100)
-    off = right.clone()
-    off[:2] = wrong
-    assert agreement([right, right + 9e-4], [right, right], off=1e-3, share=0.01)
-    assert agreement([off], [right], off=1e-3, share=0.03)
-    assert not agreement([off], [right], off=1e-3, share=0.02)
-    assert not agreement([right, right + 2e-3], [right, right], off=1e-3, share=0.01)
 
 
 def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():

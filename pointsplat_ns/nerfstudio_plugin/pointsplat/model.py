@@ -62,9 +62,9 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     computed anew at each step."""
     by: str = "merge"
     """Pruning method. merge replaces neighbours by one Gaussian each. The others keep the Gaussians with the highest
-    score: coverage, paper (eq. 3), authors, opacity, volume, log-volume, area or random."""
+    score: coverage, paper (eq. 3), authors, opacity or random."""
     opacity_weight: float | None = None
-    """Lambda of paper, authors and log-volume: the weight of opacity against volume; by default the paper's 0.3."""
+    """Lambda of paper and authors: the weight of opacity against volume; by default the paper's 0.3."""
     size: Literal["tiny", "small", "full"] = "small"
     """Size of the network: full is the paper's and needs a GPU; small and tiny are for a CPU."""
     encoder: Literal["dual", "concat"] = "dual"

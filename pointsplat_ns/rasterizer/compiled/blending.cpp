@@ -42,7 +42,7 @@ struct Task {
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
     const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
     const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
-    int64_t tiles, rows, columns, top, left, width, height, channels;
+    int64_t tiles, columns, top, left, width, height, channels;
     float log2_alpha_min, alpha_min, alpha_max, clamped_from, transmittance_min;
     float* image;        // [tiles, channels, PIXELS]
     float* final_;       // [tiles, PIXELS] transmittance left
@@ -104,8 +104,7 @@ struct Place {
 };
 
 Place place_of(const Task& task, int64_t tile) {
-    const int64_t within = tile % (task.rows * task.columns);
-    const int64_t top = (task.top + within / task.columns) * TILE, left = (task.left + within % task.columns) * TILE;
+    const int64_t top = (task.top + tile / task.columns) * TILE, left = (task.left + tile % task.columns) * TILE;
     Place place{static_cast<float>(left + TILE / 2), static_cast<float>(top + TILE / 2), {}};
     for (int row = 0; row < TILE; ++row)
         for (int column = 0; column < TILE; ++column)

@@ -67,10 +67,10 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
 def task_of(
     size: tuple[int, int], region: Region, gaussians: Tensor, offsets: Tensor, inputs: KernelInputs, chunks: Tensor
 ) -> Struct:
-    """The task of drawing a region of images of a size (width and height, pixels), without its output.
+    """The task of drawing a region of an image of a size (width and height, pixels), without its output.
 
     Args:
-        size, region: of the images.
+        size, region: of the image.
         gaussians: (P,) int64, rows of the inputs' table, by tile and front to back.
         offsets: (tiles + 1,) int64, where those of each tile start.
         inputs: the Gaussians.
@@ -78,7 +78,7 @@ def task_of(
     """
     return KERNELS.structs["Task"](
         table=inputs.table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
-        rows=region.rows, columns=region.columns, top=region.top, left=region.left, width=size[0], height=size[1],
+        columns=region.columns, top=region.top, left=region.left, width=size[0], height=size[1],
         channels=inputs.channels, log2_alpha_min=math.log2(inputs.alpha_min), alpha_min=inputs.alpha_min,
         alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=TRANSMITTANCE_MIN,
     )  # fmt: skip

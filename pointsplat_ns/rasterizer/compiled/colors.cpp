@@ -12,7 +12,7 @@ extern "C" {
 struct Colors {
     const float* directions;                 // [M, 3]
     const float *first, *rest;               // the coefficients of a Gaussian: its first, [3], and the others, [K - 1, 3]
-    int64_t first_row, rest_row;             // numbers from those of a Gaussian to those of the next
+    int64_t rest_row;                        // numbers from the others of a Gaussian to those of the next
     const int64_t* ids;                      // [M] rows of the coefficients
     int64_t count, degree;                   // M, degree of the basis
     float* colors;                           // [M, 3]
@@ -26,7 +26,7 @@ struct Colors {
 namespace {
 
 inline const float* coefficient(const Colors& task, int64_t row, int k) {
-    return k ? task.rest + task.ids[row] * task.rest_row + 3 * (k - 1) : task.first + task.ids[row] * task.first_row;
+    return k ? task.rest + task.ids[row] * task.rest_row + 3 * (k - 1) : task.first + task.ids[row] * 3;
 }
 
 // Gradient by the unit direction, from the gradients of the basis.
@@ -103,7 +103,7 @@ void color_backward_lanes(const Colors& task, const Lanes& rows) {
             }
         }
         if (task.grad_first) {
-            float* out = task.grad_first + task.ids[row] * task.first_row;
+            float* out = task.grad_first + task.ids[row] * 3;
             for (int c = 0; c < 3; ++c) out[c] = basis[0][lane] * grad[c];
         }
         if (task.grad_rest) {

@@ -7,46 +7,39 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 
 
 class CompiledColor(torch.autograd.Function):
-    """As :class:`~pointsplat_ns.rasterizer.spherical_harmonics.Color`, of coefficients (N, K, 3) or, where ``rest`` is
-    given, of the first (N, 3) and the others (N, K - 1, 3), which then need not be brought together."""
+    """As :class:`~pointsplat_ns.rasterizer.spherical_harmonics.Color`."""
 
     @staticmethod
-    def forward(ctx, directions, coefficients, rest, ids, degree):
-        directions, coefficients, ids = (t.contiguous() for t in (directions, coefficients, ids))
-        rest = None if rest is None else rest.contiguous()
+    def forward(ctx, directions, first, rest, ids, degree):
+        directions, first, rest, ids = (tensor.contiguous() for tensor in (directions, first, rest, ids))
         if len(ids):
-            first, last = ids.aminmax()
-            if first < 0 or last >= len(coefficients):
-                raise IndexError(f"ids are from {first} to {last}; expected rows of {len(coefficients)} Gaussians")
+            lowest, highest = ids.aminmax()
+            if lowest < 0 or highest >= len(first):
+                raise IndexError(f"ids are from {lowest} to {highest}; expected rows of {len(first)} Gaussians")
         colors = torch.empty_like(directions)
-        _call(_task(directions, coefficients, rest, ids, degree, colors))
+        _call(directions, first, rest, ids, degree, colors)
         ctx.degree = degree
-        ctx.save_for_backward(directions, coefficients, rest, ids, colors)
+        ctx.save_for_backward(directions, first, rest, ids, colors)
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        directions, coefficients, rest, ids, colors = ctx.saved_tensors
-        task = _task(directions, coefficients, rest, ids, ctx.degree, colors)
-        grad_directions = grad_coefficients = grad_rest = None
-        if ctx.needs_input_grad[0] and ctx.degree:  # a constant has no direction
-            grad_directions = torch.empty_like(directions)
-        if ctx.needs_input_grad[1]:
-            grad_coefficients = _zeros_like(coefficients)
-        if ctx.needs_input_grad[2]:
-            grad_rest = _zeros_like(rest)
-        first, others = (None, None) if grad_coefficients is None else _pointers(grad_coefficients, None)
-        task.fill(
-            grad_colors=grad.contiguous(), grad_directions=grad_directions, grad_first=first,
-            grad_rest=others if rest is None else grad_rest,
+        directions, first, rest, ids, colors = ctx.saved_tensors
+        wanted = ctx.needs_input_grad
+        # a constant has no direction
+        of_directions = torch.empty_like(directions) if wanted[0] and ctx.degree else None
+        of_first = _zeros_like(first) if wanted[1] else None
+        of_rest = _zeros_like(rest) if wanted[2] else None
+        _call(
+            directions, first, rest, ids, ctx.degree, colors,
+            grad_colors=grad.contiguous(), grad_directions=of_directions, grad_first=of_first, grad_rest=of_rest,
         )  # fmt: skip
-        _call(task)
-        return grad_directions, grad_coefficients, grad_rest, None, None
+        return of_directions, of_first, of_rest, None, None
 
 
 def _zeros_like(coefficients: Tensor) -> Tensor:
@@ -54,23 +47,11 @@ def _zeros_like(coefficients: Tensor) -> Tensor:
     return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
 
 
-def _pointers(coefficients: Tensor, rest: Tensor | None) -> tuple[int, int]:
-    """Addresses of the first coefficients and of the others."""
-    first = coefficients.data_ptr()
-    return first, first + 3 * coefficients.element_size() if rest is None else rest.data_ptr()
-
-
-def _task(
-    directions: Tensor, coefficients: Tensor, rest: Tensor | None, ids: Tensor, degree: int, colors: Tensor
-) -> Struct:
-    """A task without its gradients."""
-    first, others = _pointers(coefficients, rest)
-    return KERNELS.structs["Colors"](
-        directions=directions, first=first, rest=others, first_row=coefficients[:1].numel(),
-        rest_row=(coefficients if rest is None else rest)[:1].numel(), ids=ids, count=len(ids), degree=degree,
-        colors=colors,
+def _call(
+    directions: Tensor, first: Tensor, rest: Tensor, ids: Tensor, degree: int, colors: Tensor, **grads: Tensor | None
+) -> None:
+    task = KERNELS.structs["Colors"](
+        directions=directions, first=first, rest=rest, rest_row=3 * rest.shape[1], ids=ids, count=len(ids),
+        degree=degree, colors=colors, **grads,
     )  # fmt: skip
-
-
-def _call(task: Struct) -> None:
-    on_threads(task.count >= SEVERAL, KERNELS.library.pointsplat_color, task)
+    on_threads(len(ids) >= SEVERAL, KERNELS.library.pointsplat_color, task)

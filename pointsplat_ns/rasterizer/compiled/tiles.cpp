@@ -22,8 +22,7 @@ struct Grid {
 
 struct Ellipses {
     const int64_t* order;  // [M]
-    int64_t *cameras;      // [M] in depth order, as all that follows
-    float* shapes;         // [M, 7]
+    float* shapes;         // [M, 7] in depth order, as all that follows
     int64_t *row0, *row1, *column0, *widths;
     int64_t count;  // M
 };
@@ -32,7 +31,6 @@ struct Footprints {
     Grid grid;
     Ellipses ellipses;
     const float *means2d, *cov2d, *det, *opacities;  // of the projected Gaussians, in their own order
-    const int64_t* cameras;
     float alpha_min;
 };
 
@@ -45,7 +43,6 @@ void pointsplat_ellipses(const Footprints* task, int64_t* next) {
             const int64_t ahead = e.order[std::min(at + AHEAD, e.count - 1)], i = e.order[at];
             __builtin_prefetch(f.means2d + 2 * ahead), __builtin_prefetch(f.cov2d + 3 * ahead);
             __builtin_prefetch(f.det + ahead), __builtin_prefetch(f.opacities + ahead);
-            __builtin_prefetch(f.cameras + ahead);
             const float x = f.means2d[2 * i], y = f.means2d[2 * i + 1];
             const float xx = f.cov2d[3 * i], xy = f.cov2d[3 * i + 1], yy = f.cov2d[3 * i + 2];
             const float level = 2.0f * std::max(std::log(f.opacities[i] / f.alpha_min), 0.0f);
@@ -57,7 +54,6 @@ void pointsplat_ellipses(const Footprints* task, int64_t* next) {
             e.column0[at] = tile_from(x - half_x, f.grid.columns);
             const int64_t width = tile_to(x + half_x, f.grid.columns) - e.column0[at] + 1;
             e.widths[at] = std::max<int64_t>(width, 0);
-            e.cameras[at] = f.cameras[i];
         }
     });
 }
@@ -66,7 +62,7 @@ void pointsplat_ellipses(const Footprints* task, int64_t* next) {
 struct Listing {
     Grid grid;
     Ellipses ellipses;
-    int64_t top, bottom, left, right, tiles;  // the region, and its tiles in all images
+    int64_t top, bottom, left, right, tiles;  // the region, and its tiles
     const int64_t* starts;                    // [M + 1] where each Gaussian's strips start
     Strip* strips;                            // columns of the region
     int64_t* counts;              // [M] pairs of each Gaussian
@@ -83,9 +79,9 @@ inline int64_t first_row(const Listing& l, int64_t i) { return std::max(l.ellips
 // Calls ``visit`` with each Gaussian and tile that touch, by Gaussian.
 template <typename Visit>
 void each_pair(const Listing& l, Visit visit) {
-    const int64_t columns = l.right - l.left, rows = l.bottom - l.top;
+    const int64_t columns = l.right - l.left;
     for (int64_t i = 0; i < l.ellipses.count; ++i) {
-        int64_t base = (l.ellipses.cameras[i] * rows + first_row(l, i) - l.top) * columns;
+        int64_t base = (first_row(l, i) - l.top) * columns;
         for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, base += columns)
             for (int64_t tile = base + l.strips[at].from; tile <= base + l.strips[at].to; ++tile) visit(i, tile);
     }

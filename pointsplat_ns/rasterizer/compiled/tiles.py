@@ -26,16 +26,15 @@ def ellipses_of(
     det: Tensor,
     opacities: Tensor,
     order: Tensor,
-    cameras: Tensor,
     grid: Grid,
     alpha_min: float,
 ) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
-    numbers = [torch.empty_like(order) for _ in range(5)]
-    found = Ellipses(order, numbers[0], means2d.new_empty(len(order), 7), *numbers[1:])
+    numbers = [torch.empty_like(order) for _ in range(4)]
+    found = Ellipses(order, means2d.new_empty(len(order), 7), *numbers)
     task = KERNELS.structs["Footprints"](
         grid=_grid(grid), ellipses=_ellipses(found), means2d=means2d.contiguous(), cov2d=cov2d.contiguous(),
-        det=det.contiguous(), opacities=opacities.contiguous(), cameras=cameras.contiguous(), alpha_min=alpha_min,
+        det=det.contiguous(), opacities=opacities.contiguous(), alpha_min=alpha_min,
     )  # fmt: skip
     on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_ellipses, task)
     return found
@@ -48,7 +47,7 @@ def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
     starts = torch.zeros(count + 1, **INDICES)
     torch.cumsum(heights, 0, out=starts[1:])
     strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32, device="cpu"), torch.zeros_like(ellipses.order)
-    tiles = grid.cameras * region.rows * region.columns
+    tiles = region.rows * region.columns
     offsets = torch.zeros(tiles + 1, **INDICES)
     task = KERNELS.structs["Listing"](
         grid=_grid(grid), ellipses=_ellipses(ellipses), **region._asdict(), tiles=tiles, starts=starts, strips=strips,
