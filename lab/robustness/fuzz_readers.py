@@ -103,7 +103,6 @@ READERS |= {
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
     "ksplat": at("a.ksplat", _scene, inside=_ksplat),
-    "glb": at("a.glb", _scene),  # also with SPZ inside
     "zip": at("a.zip", _scene),  # as they are
     "zipped-ply": at("a.zip", _scene, inside=lambda data: _zip_of({"a.ply": data})),
     "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch

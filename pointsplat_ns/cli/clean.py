@@ -24,7 +24,7 @@ def clean(
     """Remove floaters, and what cannot be drawn or is seen from nowhere.
 
     Args:
-        output: file to write: .ply, .spz, .sog, .splat, .glb; by default in the format of the scene and
+        output: file to write: .ply, .spz, .sog, .splat; by default in the format of the scene and
             beside it: room_clean.ply for room.ply.
         strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
             hardly change. 0 removes only what cannot be drawn or seen.

@@ -38,14 +38,14 @@ def convert(
         scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .ksplat), a Splatfacto
             checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
-            folder), .splat or .glb. For a folder of scenes, another folder.
+            folder) or .splat. For a folder of scenes, another folder.
         sh: SH bands to keep: all, or up to a degree.
         up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up direction is estimated;
             -y:z names it as -y. Write --up=-y for a negative axis.
         scale: factor on positions and sizes.
         original_frame: for a Splatfacto run: undo nerfstudio's rotation, shift and scale of its data.
         recentre: write positions relative to their rounded median, so that float32 keeps their digits. The offset is
-            kept in .ply, .compressed.ply and .glb files.
+            kept in .ply and .compressed.ply files.
         offset: write positions relative to this point of the scene's frame; 0 0 0 writes them in the frame itself.
         spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
         spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a

@@ -33,7 +33,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "convert": (
         ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
         ("a run, in the frame of its photos' poses", "pointsplat convert outputs/room room.ply --original-frame"),
-        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.glb --up=-y:z"),
+        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.spz --up=-y:z"),
     ),
     "info": (
         ("what is in a scene", "pointsplat info room.ply"),

@@ -44,7 +44,7 @@ def prune(
     they are sampled.
 
     Args:
-        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
+        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog or .splat. By
             default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in a run's folder. For
             a folder of scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format
             of its scene.

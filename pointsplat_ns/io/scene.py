@@ -58,7 +58,7 @@ def read_scene(path: Path | str) -> Gaussians:
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
             SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, ``.ksplat``,
-            ``.glb``, a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
+            a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
             ``config.yml`` or a run's folder. The photos of a run are not needed.
 
     Returns:
@@ -136,8 +136,7 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, 
     """Write a scene in the format that the path's name asks for.
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
-    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
-    glTF, exact to rounding. Gaussians that cannot be drawn (NaN, or Inf where it is not
+    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder) and ``.splat``. Gaussians that cannot be drawn (NaN, or Inf where it is not
     valid) are left out, and their number is logged. The file appears whole or not at all.
 
     Args:
@@ -181,7 +180,7 @@ def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
     """Log what a format does not hold of a scene, float32 on the CPU, and which format does."""
     found = losses(scene, kind.capacity)
     if found:
-        others = (format_named(suffix) for suffix in (".sog", ".glb", ".ply"))
+        others = (format_named(suffix) for suffix in (".sog", ".ply"))
         keeper = next(other.suffix for other in others if other is not None and not losses(scene, other.capacity))
         logger.warning("%s: lost in %s: %s; %s keeps it", name, kind.name, "; ".join(found), keeper)
 

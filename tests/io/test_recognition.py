@@ -43,7 +43,7 @@ def checkpoint(step=7):
 def contents(tmp_path_factory):
     """Name of a format to the bytes of a file of it, and the scene that is read from them."""
     folder = tmp_path_factory.mktemp("contents")
-    for suffix in (".ply", ".compressed.ply", ".glb"):
+    for suffix in (".ply", ".compressed.ply"):
         ps.save(SCENE, folder / f"a{suffix}")
     ply = (folder / "a.ply").read_bytes()
     found = {
@@ -52,7 +52,6 @@ def contents(tmp_path_factory):
         "SPZ 3": (encode_spz(SCENE), ".spz"),
         "SPZ 4": (encode_spz(SCENE, version=4), ".spz"),
         "SOG": (encode_sog(SCENE), ".sog"),
-        "glTF": ((folder / "a.glb").read_bytes(), ".glb"),
         "checkpoint": (torch_bytes(checkpoint()), ".ckpt"),
         "checkpoint of old torch": (torch_bytes(checkpoint(), _use_new_zipfile_serialization=False), ".ckpt"),
         "zipped PLY": (zip_of(**{"room/scan.ply": ply, "__MACOSX/room/._scan.ply": b"mac"}), ".zip"),
@@ -65,7 +64,7 @@ def contents(tmp_path_factory):
 
 
 NAMES = [
-    "x.ply", "x.compressed.ply", "x.spz", "x.sog", "x.splat", "x.ksplat", "x.glb", "x.ckpt", "x.pt", "x.pth", "x.zip",
+    "x.ply", "x.compressed.ply", "x.spz", "x.sog", "x.splat", "x.ksplat", "x.ckpt", "x.pt", "x.pth", "x.zip",
     "x", "x.PLY", "x.bin", "x.yml", "x.las",
 ]  # fmt: skip
 KINDS = {
@@ -138,7 +137,7 @@ REFUSED = {
     "z.zip": (zip_of(**{"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
     "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
     "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
-    "x.glb": (b"", "not a .glb file"),
+    "x.glb": (b"glTF" + bytes(60), "glTF files are not read; export the scene"),
 }
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.io.files import one_line, replacing, require_space
-from pointsplat_ns.io.formats import compressed_ply, glb_writing, ksplat, rad, sog, splat, spz_range
+from pointsplat_ns.io.formats import compressed_ply, ksplat, rad, sog, splat, spz_range
 from pointsplat_ns.io.formats.coding import PACKED, morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
     compressed_ply_bytes,
@@ -29,8 +29,6 @@ from pointsplat_ns.io.formats.compressed_ply import (
     is_compressed,
     read_compressed_ply,
 )
-from pointsplat_ns.io.formats.glb import read_glb
-from pointsplat_ns.io.formats.glb_writing import encode_glb, glb_bytes
 from pointsplat_ns.io.formats.holding import Holds
 from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.rounding import Rounding
@@ -176,13 +174,12 @@ FORMATS = (
         "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
         capacity=splat.HOLDS, order=drawing_order,
     ),
-    Format("glTF", ".glb", read_glb, writer(encode_glb), (b"glTF",), bytes_of=glb_bytes, capacity=glb_writing.HOLDS),
     Format("zipped PLY", "", read_zipped, holds="*.ply"),
     Format("LCC", ".lcc", instead=_LCC), Format("LCC", ".lcc2", instead=_LCC),
     Format("Postshot project", ".psht", instead=_EXPORT),
     Format("RAD", ".rad", instead=_EXPORT, capacity=rad.HOLDS),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
-    Format("glTF with separate files", ".gltf", instead="convert it to one .glb file"),
+    Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
     Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
     Format("E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it holds points, no Gaussians"),
     Format("Git LFS pointer", "", starts=(b"version https://git-lfs",), instead="fetch the file with git lfs pull"),
