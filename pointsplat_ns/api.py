@@ -46,7 +46,7 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
 
     Args:
         path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``,
-            ``.ksplat``, a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS, a Splatfacto run (its
+            a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS, a Splatfacto run (its
             folder or ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined as in its
             training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.

@@ -50,8 +50,8 @@ class SceneError(PointSplatError):
         ... except ps.SceneError as error:
         ...     print(error)
         nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, lod-meta.json, meta.json, \
-.ksplat, .splat, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a \
-Splatfacto run (its folder or config.yml)
+.splat, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a Splatfacto run \
+(its folder or config.yml)
     """
 
 

@@ -88,11 +88,6 @@ def _gzipped(data: bytes) -> bytes:
     return gzip.compress(data, 1, mtime=0)
 
 
-def _ksplat(data: bytes) -> bytes:
-    """The first 64 bytes of each of two headers, which zeros fill up, and the rows."""
-    return data[:64].ljust(4096, b"\0") + data[64:128].ljust(1024, b"\0") + data[128:]
-
-
 READERS |= {
     "ply": at("a.ply", _scene),
     "compressed-ply": at("a.compressed.ply", _scene),
@@ -102,7 +97,6 @@ READERS |= {
     "sog": at("a.sog", _scene),  # as they are: zip archives
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
-    "ksplat": at("a.ksplat", _scene, inside=_ksplat),
     "zip": at("a.zip", _scene),  # as they are
     "zipped-ply": at("a.zip", _scene, inside=lambda data: _zip_of({"a.ply": data})),
     "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch

@@ -35,7 +35,7 @@ def convert(
     """Write a scene in another format, or all scenes of a folder. What formats lose stands in docs/formats.md.
 
     Args:
-        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat, .ksplat), a Splatfacto
+        scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat), a Splatfacto
             checkpoint, a run (its folder or config.yml), or a folder of scenes.
         output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, meta.json (a SOG as a
             folder) or .splat. For a folder of scenes, another folder.

@@ -57,7 +57,7 @@ def read_scene(path: Path | str) -> Gaussians:
 
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
-            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, ``.ksplat``,
+            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``,
             a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
             ``config.yml`` or a run's folder. The photos of a run are not needed.
 

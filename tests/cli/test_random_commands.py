@@ -82,7 +82,7 @@ def contents() -> dict[str, bytes]:
         **good,
         **{f"cut.{name}": data[: len(data) * 2 // 3] for name, data in good.items()},
         **{f"empty.{suffix}": b"" for suffix in ("ply", "spz", "sog", "splat", "ckpt", "safetensors", "json", "yml")},
-        **{f"text.{suffix}": b"no scene\n" for suffix in ("ply", "spz", "ksplat", "ckpt", "safetensors", "yml")},
+        **{f"text.{suffix}": b"no scene\n" for suffix in ("ply", "spz", "ckpt", "safetensors", "yml")},
         **{
             name: ply for name in ("a b.ply", "\x1b]0;x\x07.ply", "two\nlines.ply", "ünï🙂.ply", "-o.ply", "\udcff.ply")
         },

@@ -6,7 +6,7 @@ from documented import ROOT
 from pointsplat_ns.io.formats import FORMATS
 
 PAGE = ROOT / "docs" / "formats.md"
-SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".ksplat", ".rad")
+SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".rad")
 COLUMNS = ("positions", "sizes", "colours", "opacities", "rotations", "sh")
 
 

@@ -8,7 +8,6 @@ import tracemalloc
 import zipfile
 import zlib
 
-import numpy as np
 import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
@@ -24,49 +23,12 @@ from pointsplat_ns.io.formats.spz import encode_spz
 SEED = 5
 
 
-def ksplat(compression=1, degree=1, n=40, bucket=16):
-    """A ``.ksplat`` file of random bytes that make sense, in one section with two full buckets and one partly full."""
-    rng = np.random.default_rng(SEED)
-    full, rest = divmod(n, bucket)
-    k = 3 * ((degree + 1) ** 2 - 1)
-    head = bytearray(4096)
-    struct.pack_into("<BB2xIIIIH", head, 0, 0, 1, 1, 1, n, n, compression)
-    section = bytearray(1024)
-    buckets = full + 1 if compression else 0
-    stored = 12 if compression else 0
-    struct.pack_into(
-        "<IIIIfHxxIIIIH", section, 0, n, n, bucket, buckets, 5.0, stored, 32767 if compression else 0, 0,
-        full if compression else 0, 1 if compression else 0, degree,
-    )  # fmt: skip
-    number = ("<f4", "<f2", "<f2")[compression]
-    row = np.dtype(
-        [
-            ("means", ("<f4", "<u2", "<u2")[compression], 3),
-            ("stds", number, 3),
-            ("quats", number, 4),
-            ("rgba", "u1", 4),
-            ("sh", ("<f4", "<f2", "u1")[compression], (k,)),
-        ]
-    )
-    rows = np.zeros(n, row)
-    rows["means"] = rng.normal(size=(n, 3)) if compression == 0 else rng.integers(0, 65535, (n, 3))
-    rows["stds"], rows["quats"] = rng.uniform(0.01, 1, (n, 3)), rng.normal(size=(n, 4))
-    rows["rgba"] = rng.integers(0, 256, (n, 4))
-    rows["sh"] = rng.normal(size=(n, k)) if compression < 2 else rng.integers(0, 256, (n, k))
-    middle = b""
-    if compression:
-        centres = np.arange(3 * buckets, dtype="<f4")
-        middle = struct.pack("<I", rest) + centres.tobytes()
-    return bytes(head + section) + middle + rows.tobytes(), rows
-
-
 FILES = {
     ".compressed.ply": encode_compressed_ply(cloud(300, SEED, 1)),
     ".spz": encode_spz(cloud(300, SEED, 1)),
     "4.spz": encode_spz(cloud(300, SEED, 1), version=4),
     ".sog": encode_sog(cloud(300, SEED, 1)),
     ".splat": encode_splat(cloud(300, SEED, 0)),
-    ".ksplat": ksplat()[0],
 }
 
 
@@ -105,27 +67,6 @@ def test_a_garbled_file_is_read_or_refused_in_one_line(tmp_path, name, data):
         assert "\n" not in str(error) and str(path) in str(error)
     else:
         assert bool(scene.usable().all())
-
-
-@pytest.mark.parametrize("compression", [0, 1, 2])
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_ksplat_is_decoded_as_its_fields_say(tmp_path, compression, degree):
-    data, rows = ksplat(compression, degree)
-    (tmp_path / "a.ksplat").write_bytes(data)
-    scene = ps.load(tmp_path / "a.ksplat")
-    assert len(scene) == 40 and scene.sh_degree == degree
-    expected = rows["means"].astype(np.float64)
-    if compression:
-        centres = np.repeat(np.arange(9.0).reshape(3, 3), [16, 16, 8], axis=0)
-        expected = (expected - 32767) * (2.5 / 32767) + centres
-    assert np.allclose(scene.means.numpy(), expected, atol=1e-5)
-    assert np.allclose(scene.stds.numpy(), rows["stds"].astype(np.float32), rtol=1e-5)
-    sh = rows["sh"].astype(np.float64) if compression < 2 else rows["sh"] / 255 * 3 - 1.5
-    for band, start in ((1, 0), (2, 9))[:degree]:
-        size, first = 2 * band + 1, band**2 - 1
-        for channel in range(3):
-            part = sh[:, start + channel * size : start + (channel + 1) * size]
-            assert np.allclose(scene.features_rest[:, first : first + size, channel].numpy(), part, atol=1e-6)
 
 
 def most_memory(path):
@@ -233,14 +174,6 @@ def test_a_compressed_ply_that_lies_is_refused_by_what_is_wrong(tmp_path, old, n
     assert old in FILES[".compressed.ply"]
     (tmp_path / "a.ply").write_bytes(FILES[".compressed.ply"].replace(old, new, 1))
     refused(tmp_path / "a.ply", fragment)
-
-
-def test_a_ksplat_that_declares_more_than_it_holds_takes_no_memory(tmp_path):
-    for at in (16, 4096, 4096 + 4, 4096 + 12, 4096 + 32, 4096 + 36):
-        data = bytearray(FILES[".ksplat"])
-        struct.pack_into("<I", data, at, 2**31)
-        (tmp_path / "a.ksplat").write_bytes(data)
-        assert most_memory(tmp_path / "a.ksplat") < 1e6
 
 
 @pytest.mark.parametrize("version", [3, 4])

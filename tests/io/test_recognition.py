@@ -64,7 +64,7 @@ def contents(tmp_path_factory):
 
 
 NAMES = [
-    "x.ply", "x.compressed.ply", "x.spz", "x.sog", "x.splat", "x.ksplat", "x.ckpt", "x.pt", "x.pth", "x.zip",
+    "x.ply", "x.compressed.ply", "x.spz", "x.sog", "x.splat", "x.ckpt", "x.pt", "x.pth", "x.zip",
     "x", "x.PLY", "x.bin", "x.yml", "x.las",
 ]  # fmt: skip
 KINDS = {
@@ -128,7 +128,8 @@ REFUSED = {
         zip_of(**{"a.jpg": "", "b.jpg": "", "c.jpg": "", "d.jpg": ""}),
         "a zip archive of a.jpg, b.jpg, c.jpg and 1",
     ),
-    "x.lcc": (b"{}", "LCC files are not read; convert them"),
+    "x.lcc": (b"{}", "LCC files are not read; convert it"),
+    "x.ksplat": (bytes(9000), "ksplat files are not read; convert it to .ply or .sog"),
     "x.spz": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "Git LFS pointer"),
     "y.ply": (b"<!DOCTYPE html><html>", "web page"),
     "y.splat": (b"LASF" + bytes(60), "LAS point cloud"),

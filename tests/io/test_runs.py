@@ -145,11 +145,11 @@ def test_every_kind_of_path_reads_the_same_scene(make_run, tmp_path):
 
 
 def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
-    accepted = ".ksplat, .splat, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS"
+    accepted = ".splat, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS"
     (tmp_path / "scene.obj").write_bytes(b"")
     fails(lambda: read_scene(tmp_path / "scene.obj"), tmp_path / "scene.obj", "a .obj file", accepted)
     fails(lambda: read_scene(tmp_path), "a folder without config.yml or meta.json", accepted)
     fails(lambda: read_scene(tmp_path / "none.ply"), "no such file", accepted)
     fails(lambda: save(normal_scene(), tmp_path / "a.obj"), "cannot write a .obj file", ".spz, .sog")
-    fails(lambda: save(normal_scene(), tmp_path / "a.ksplat"), "cannot write a ksplat file")
+    fails(lambda: save(normal_scene(), tmp_path / "a.rad"), "cannot write a RAD file")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.obj"]

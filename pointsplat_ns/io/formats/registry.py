@@ -1,7 +1,7 @@
 """The formats of scene files: which there are, and which one a path means.
 
 One table decides for every file: what a file begins with, or for a zip archive what is in it, tells the format,
-whatever its name. Only formats without a sign of their own (``.splat``, ``.ksplat``) go by the name.
+whatever its name. Only ``.splat``, which has no sign of its own, goes by the name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.io.files import one_line, replacing, require_space
-from pointsplat_ns.io.formats import compressed_ply, ksplat, rad, sog, splat, spz_range
+from pointsplat_ns.io.formats import compressed_ply, rad, sog, splat, spz_range
 from pointsplat_ns.io.formats.coding import PACKED, morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
     compressed_ply_bytes,
@@ -30,7 +30,6 @@ from pointsplat_ns.io.formats.compressed_ply import (
     read_compressed_ply,
 )
 from pointsplat_ns.io.formats.holding import Holds
-from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
 from pointsplat_ns.io.formats.sog_images import META
@@ -139,7 +138,7 @@ def _unpack(path: Path, part: Path) -> str:
 
 _PLY = (b"ply\n", b"ply\r")
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
-_LCC = "convert them to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
+_CONVERT = "convert it to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
 _EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 
 FORMATS = (
@@ -169,13 +168,12 @@ FORMATS = (
         "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog,
         capacity=sog.HOLDS, order=morton_order,
     ),
-    Format("ksplat", ".ksplat", read_ksplat, capacity=ksplat.HOLDS),
     Format(
         "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
         capacity=splat.HOLDS, order=drawing_order,
     ),
     Format("zipped PLY", "", read_zipped, holds="*.ply"),
-    Format("LCC", ".lcc", instead=_LCC), Format("LCC", ".lcc2", instead=_LCC),
+    *(Format(name, suffix, instead=_CONVERT) for name, suffix in (("ksplat", ".ksplat"), ("LCC", ".lcc"), ("LCC", ".lcc2"))),
     Format("Postshot project", ".psht", instead=_EXPORT),
     Format("RAD", ".rad", instead=_EXPORT, capacity=rad.HOLDS),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
