@@ -45,10 +45,9 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
     """Read a scene.
 
     Args:
-        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``,
-            a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS, a Splatfacto run (its
-            folder or ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined as in its
-            training.
+        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``), a
+            checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat`` run, whose
+            dense scene is then pruned and refined as in its training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.
         data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run says.
 

@@ -98,7 +98,6 @@ READERS |= {
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
     "zip": at("a.zip", _scene),  # as they are
-    "zipped-ply": at("a.zip", _scene, inside=lambda data: _zip_of({"a.ply": data})),
     "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch
 }
 
@@ -123,12 +122,6 @@ def gsplat_bytes(scene: Gaussians) -> bytes:
     return _saved({"step": 1, "splats": values})
 
 
-def inria_bytes(scene: Gaussians) -> bytes:
-    """A checkpoint of INRIA's 3D Gaussian Splatting, without the optimiser's numbers."""
-    values = (scene.means, scene.features_dc[:, None], scene.features_rest, scene.scales, scene.quats, scene.opacities)
-    return _saved(((scene.sh_degree, *values, *[torch.zeros(len(scene))] * 3, {"state": {}}, 3.0), 1))
-
-
 def _zip_of(parts: dict[str, bytes]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
@@ -148,7 +141,6 @@ def _pickle_in(checkpoint: bytes) -> Make:
 READERS |= {
     "checkpoint-pickle": _pickle_in(_checkpoint_bytes(some_scene())),
     "gsplat-pickle": _pickle_in(gsplat_bytes(some_scene())),
-    "inria-pickle": _pickle_in(inria_bytes(some_scene())),
 }
 
 

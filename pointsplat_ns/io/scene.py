@@ -25,13 +25,13 @@ from pointsplat_ns.io.formats.holding import losses
 from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.offsets import warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
-from pointsplat_ns.io.splatfacto import checkpoint_parts, open_checkpoint, read_checkpoint
+from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (
-    f"a scene ({READABLE}, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a "
-    "Splatfacto run (its folder or config.yml)"
+    f"a scene ({READABLE}), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or "
+    "config.yml)"
 )
 
 
@@ -57,9 +57,9 @@ def read_scene(path: Path | str) -> Gaussians:
 
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
-            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``,
-            a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
-            ``config.yml`` or a run's folder. The photos of a run are not needed.
+            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, a checkpoint of
+            Splatfacto (``.ckpt``) or gsplat (``.pt``), ``config.yml`` or a run's folder. The photos of a run are not
+            needed.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -136,8 +136,9 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, 
     """Write a scene in the format that the path's name asks for.
 
     ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
-    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder) and ``.splat``. Gaussians that cannot be drawn (NaN, or Inf where it is not
-    valid) are left out, and their number is logged. The file appears whole or not at all.
+    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder) and ``.splat``. Gaussians
+    that cannot be drawn (NaN, or Inf where it is not valid) are left out, and their number is logged. The file appears
+    whole or not at all.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,
@@ -187,9 +188,9 @@ def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
 
 @dataclass(frozen=True)
 class SourceFile:
-    """The file that a dense scene was read from. Of a SOG folder, streamed or not, and of a checkpoint in parts,
-    ``name`` is that of the folder, ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of
-    each, by its path in the folder."""
+    """The file that a dense scene was read from. Of a SOG folder, streamed or not, ``name`` is that of the folder,
+    ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of each, by its path in the
+    folder."""
 
     name: str
     bytes: int
@@ -210,15 +211,15 @@ def source_file(path: Path | str) -> SourceFile:
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, all
-    parts of a checkpoint, or one. Raises SceneError if a run has none, or a folder cannot be read."""
+    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, or
+    one. Raises SceneError if a run has none, or a folder cannot be read."""
     path = Path(path)
     parts = _sog_parts(path)
     if parts:
         return parts
     if may_be_run(path) and not (path.is_file() and format_to_read(path)):
         return [open_run(path, need_data=False).checkpoint]
-    return checkpoint_parts(path)
+    return [path]
 
 
 def _sog_parts(path: Path) -> list[Path]:

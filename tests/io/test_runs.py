@@ -145,7 +145,7 @@ def test_every_kind_of_path_reads_the_same_scene(make_run, tmp_path):
 
 
 def test_anything_else_is_refused_with_what_is_accepted(tmp_path):
-    accepted = ".splat, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS"
+    accepted = ".splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt)"
     (tmp_path / "scene.obj").write_bytes(b"")
     fails(lambda: read_scene(tmp_path / "scene.obj"), tmp_path / "scene.obj", "a .obj file", accepted)
     fails(lambda: read_scene(tmp_path), "a folder without config.yml or meta.json", accepted)

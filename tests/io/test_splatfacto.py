@@ -110,7 +110,7 @@ OTHER_METHOD = {"step": 1, "pipeline": {f"_model.field.mlp.{i}.weight": torch.ze
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        *((some, ["expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"])
+        *((some, ["expected a checkpoint that Splatfacto or gsplat saved"])
           for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")),
         ({"state_dict": {}, "epoch": 3}, ["not a checkpoint of a scene", "found epoch, state_dict"]),
         ([1], ["not a checkpoint of a scene", "found list"]),

@@ -7,10 +7,7 @@ whatever its name. Only ``.splat``, which has no sign of its own, goes by the na
 from __future__ import annotations
 
 import fnmatch
-import shutil
-import tempfile
 import zipfile
-import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,9 +17,9 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
-from pointsplat_ns.io.files import one_line, replacing, require_space
+from pointsplat_ns.io.files import one_line, replacing
 from pointsplat_ns.io.formats import compressed_ply, rad, sog, splat, spz_range
-from pointsplat_ns.io.formats.coding import PACKED, morton_order
+from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import (
     compressed_ply_bytes,
     encode_compressed_ply,
@@ -94,48 +91,6 @@ def writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
     return write
 
 
-def read_zipped(path: Path) -> Gaussians:
-    """Read the one PLY, compressed or not, in a zip archive, as websites and mail send scenes. It is unpacked into a
-    temporary folder. Raises SceneError if there are several PLYs, the PLY declares more bytes than its packed bytes can
-    hold, does not fit on the disk, or is damaged."""
-    with tempfile.TemporaryDirectory(prefix="pointsplat-") as folder:
-        part = Path(folder) / "scene.ply"
-        name = _unpack(path, part)
-        try:
-            with part.open("rb") as stream:
-                compressed = is_compressed(read_header(stream, part))
-            return read_compressed_ply(part) if compressed else read_ply(part)
-        except SceneError as error:
-            raise SceneError(str(error).replace(str(part), f"{path}: {name}")) from error
-
-
-def _unpack(path: Path, part: Path) -> str:
-    """Write the one PLY of an archive to a file; its name in the archive."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            # Archives of macOS have a second entry for each file, with what its system keeps beside it.
-            entries = [
-                entry
-                for entry in archive.infolist()
-                if entry.filename.lower().endswith(".ply") and not entry.filename.rpartition("/")[2].startswith(".")
-            ]
-            if len(entries) != 1:
-                names = ", ".join(entry.filename for entry in entries[:3])
-                raise SceneError(f"{path}: {len(entries)} PLY files ({names}); expected one; unpack them")
-            [entry] = entries
-            if entry.file_size > max(1 << 22, PACKED * entry.compress_size):
-                raise SceneError(
-                    f"{path}: {entry.filename} has {entry.file_size} bytes, more than {entry.compress_size} compressed "
-                    "bytes of a scene can hold"
-                )
-            require_space(path, part.parent, entry.file_size)
-            with archive.open(entry) as packed, part.open("wb") as stream:  # no more than its size comes out
-                shutil.copyfileobj(packed, stream, 1 << 20)
-            return entry.filename
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, zlib.error) as error:
-        raise SceneError(f"{path}: damaged; its PLY cannot be unpacked ({one_line(error)})") from error
-
-
 _PLY = (b"ply\n", b"ply\r")
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _CONVERT = "convert it to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
@@ -172,8 +127,9 @@ FORMATS = (
         "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
         capacity=splat.HOLDS, order=drawing_order,
     ),
-    Format("zipped PLY", "", read_zipped, holds="*.ply"),
-    *(Format(name, suffix, instead=_CONVERT) for name, suffix in (("ksplat", ".ksplat"), ("LCC", ".lcc"), ("LCC", ".lcc2"))),
+    Format("zip of a PLY", "", holds="*.ply", instead="unpack it and name the PLY"),
+    Format("ksplat", ".ksplat", instead=_CONVERT),
+    Format("LCC", ".lcc", instead=_CONVERT), Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
     Format("RAD", ".rad", instead=_EXPORT, capacity=rad.HOLDS),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
@@ -238,7 +194,7 @@ def _told_by_zip(path: Path) -> Format | None:
     told = next((kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None)
     if told is None:
         found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected one of a PLY, a SOG or a checkpoint")
+        raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected a SOG or a checkpoint")
     return told
 
 
