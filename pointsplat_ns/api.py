@@ -46,8 +46,8 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
 
     Args:
         path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``), a
-            checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat`` run, whose
-            dense scene is then pruned and refined as in its training.
+            checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat``
+            run, whose dense scene is then pruned and refined as in its training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.
         data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run says.
 

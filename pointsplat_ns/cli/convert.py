@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +23,6 @@ def convert(
     original_frame: bool = False,
     recentre: bool = False,
     offset: tuple[float, float, float] | None = None,
-    spz_version: Literal[3, 4] = 3,
-    spz_sh_bits: tuple[int, int] | None = None,
     to: str | None = None,
     force: options.Force = False,
     jobs: options.Jobs = None,
@@ -47,19 +43,12 @@ def convert(
         recentre: write positions relative to their rounded median, so that float32 keeps their digits. The offset is
             kept in .ply and .compressed.ply files.
         offset: write positions relative to this point of the scene's frame; 0 0 0 writes them in the frame itself.
-        spz_version: version of an .spz file. 4 is newer, and fewer viewers read it.
-        spz_sh_bits: bits of SH coefficients in an .spz file, for degree 1 and for the others, up to 8. More bits give a
-            larger file and a better picture. By default 6 and 5; SH from an .spz file stay as they are.
         to: for a folder: the format of all results, such as .spz; by default none.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.formats.registry import writer
-    from pointsplat_ns.io.formats.spz import encode_spz
-    from pointsplat_ns.io.scene import is_folder_of_scenes, save_as
+    from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.pruning import cut_sh
-    from pointsplat_ns.system.progress import progress_bar
 
     if recentre and offset is not None:
         raise ps.PointSplatError("--recentre and --offset both given; expected one of them")
@@ -69,9 +58,8 @@ def convert(
 
         if to is None:
             raise ps.SceneError(f"{scene}: a folder of scenes; expected their new format, such as --to .spz")
-        one = {"--spz-version": None if spz_version == 3 else spz_version, "--spz-sh-bits": spz_sh_bits}
         return folder_command(
-            convert_folder, scene, output, one, json_output, jobs,
+            convert_folder, scene, output, {}, json_output, jobs,
             suffix=to, sh=sh, up=up, scale=scale, original_frame=original_frame, offset=point, force=force,
         )  # fmt: skip
     options.need_no_jobs(scene, jobs)
@@ -82,12 +70,7 @@ def convert(
     before = ps.load(scene)
     after = before if sh == "all" else cut_sh(before, int(sh))
     after = ps.place(after, up, scale, scene if original_frame else None, point)
-    kind = format_to_write(output)
-    if kind.suffix == ".spz":
-        encode = functools.partial(encode_spz, version=spz_version, sh_bits=spz_sh_bits)
-        kind = dataclasses.replace(kind, write=writer(encode))
-    with progress_bar() as report:
-        save_as(kind, after, output, report)
+    ps.save(after, output, progress=True, overwrite=True)
     seconds = time.perf_counter() - start
     if json_output:
         print_json(scene_result(len(before), after, seconds, output))

@@ -1,10 +1,12 @@
 """Scene files of every format: what comes back, that the order is known, and that sizes are as said."""
 
 import logging
+import struct
 
 import numpy as np
 import pytest
 from plys import columns_of, write_columns
+from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
@@ -37,12 +39,12 @@ def test_the_same_scene_gives_the_same_bytes(tmp_path, suffix):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
-def test_spz_4_holds_what_spz_3_holds(tmp_path):
+def test_spz_4_is_read_as_spz_3_and_extensions_are_said_to_be_left_out(tmp_path, caplog):
     scene = cloud(500, 1, 2)
-    for version in (3, 4):
-        (tmp_path / f"{version}.spz").write_bytes(encode_spz(scene, version=version))
-    assert (tmp_path / "3.spz").read_bytes()[:2] == b"\x1f\x8b" and (tmp_path / "4.spz").read_bytes()[:4] == b"NGSP"
+    (tmp_path / "3.spz").write_bytes(encode_spz(scene))
+    (tmp_path / "4.spz").write_bytes(encode_spz4(scene, struct.pack("<II4s", 7, 4, b"what")))
     assert same_bits(ps.load(tmp_path / "3.spz"), ps.load(tmp_path / "4.spz"))
+    assert caplog.messages == [f"{tmp_path / '4.spz'}: extensions of the SPZ file are not read"]
 
 
 def test_a_sog_folder_is_read_by_both_names_and_equals_the_file(tmp_path):

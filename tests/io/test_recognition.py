@@ -8,6 +8,7 @@ import zipfile
 
 import pytest
 import torch
+from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import cloud, same_bits, write_run
@@ -50,7 +51,7 @@ def contents(tmp_path_factory):
         "3DGS PLY": (ply, ".ply"),
         "compressed PLY": ((folder / "a.compressed.ply").read_bytes(), ".compressed.ply"),
         "SPZ 3": (encode_spz(SCENE), ".spz"),
-        "SPZ 4": (encode_spz(SCENE, version=4), ".spz"),
+        "SPZ 4": (encode_spz4(SCENE), ".spz"),
         "SOG": (encode_sog(SCENE), ".sog"),
         "checkpoint": (torch_bytes(checkpoint()), ".ckpt"),
         "checkpoint of old torch": (torch_bytes(checkpoint(), _use_new_zipfile_serialization=False), ".ckpt"),

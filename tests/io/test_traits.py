@@ -7,13 +7,13 @@ import json
 
 import pytest
 import torch
+from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.geometry.transforms import AXES, direction_of
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.io.turning import turned
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
@@ -78,7 +78,7 @@ def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
         ps.save(scene, named(tmp_path, suffix), overwrite=True)
         back = ps.load(named(tmp_path, suffix))
         assert back.antialiased is scene.antialiased and len(back) == 20
-    (tmp_path / "4.spz").write_bytes(encode_spz(trained_so(cloud(20)), version=4))
+    (tmp_path / "4.spz").write_bytes(encode_spz4(trained_so(cloud(20))))
     assert ps.load(tmp_path / "4.spz").antialiased
 
 
