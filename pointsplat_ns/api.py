@@ -6,7 +6,6 @@ Each command of the command line calls one of these functions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 from pointsplat_ns.compacting import Looking, Source, compact_source, log, prune_source, read_source
@@ -286,16 +285,15 @@ def lod(
     PruneRequest(1.0, sh=sh)
     output = LevelOutput.of(folder, stream, tiles, html, at, up, force)
     viewer = web_viewer() if html else None
-    with ExitStack() as stack:
-        if output is not None:
-            stack.enter_context(output.claim(len(budgets), tuple(viewer or ())))
-        dense, view_source = read_source(scene, Looking(views, resolution, up, data))
-        source = None if isinstance(scene, Gaussians) else source_file(scene)
-        page = None
-        if viewer is not None and output is not None:
-            known = view_source.known(VIEW_COUNTS.opening)
-            page = stream_page(viewer, dense, known, up_named(up), output.path.resolve().name)
-        report = stack.enter_context(progress_bar(progress))
+    if output is not None:
+        output.check(len(budgets), tuple(viewer or ()))
+    dense, view_source = read_source(scene, Looking(views, resolution, up, data))
+    source = None if isinstance(scene, Gaussians) else source_file(scene)
+    page = None
+    if viewer is not None and output is not None:
+        known = view_source.known(VIEW_COUNTS.opening)
+        page = stream_page(viewer, dense, known, up_named(up), output.path.resolve().name)
+    with progress_bar(progress) as report:
         made = make_levels(dense, levels, sh, view_source, source, report)
         made = made if output is None else output.write(made, page, report)
     log((*made.notes, *([page.note] if page else [])))

@@ -41,7 +41,7 @@ def clean(
     options.need_one_scene(scene)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "clean")
-    options.claim_outputs(output, force, picture)
+    options.check_outputs(output, force, picture)
     looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).budget_suffix
     with fixed_threads(threads):
         dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)

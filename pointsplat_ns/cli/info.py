@@ -39,7 +39,7 @@ def info(
 
     if not any(map(os.path.exists, scenes)):
         options.need_scenes(*scenes)
-    options.claim_outputs(None, force, views)
+    options.check_outputs(None, force, views)
     scenes = tuple(path for scene in scenes for path in _scenes_of(scene))
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")

@@ -30,7 +30,6 @@ class FolderFiles:
     scenes: str = "pointsplat-scenes.json"
     """Command and options that all results in a folder of scenes have in common."""
     scenes_table: str = "scenes.csv"
-    scenes_lock: str = ".scenes.lock"
     levels: str = "lod.json"
     """Manifest of levels of detail."""
     levels_picture: str = "lod.png"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, logger, never_replaced, one_line, require_file
+from pointsplat_ns.io.files import content_hash, logger, one_line, require_file
 from pointsplat_ns.io.formats import (
     READABLE,
     SOG_META,
@@ -162,7 +162,7 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, 
     kind = format_to_write(path)
     if path.is_file() and not overwrite:
         raise SceneError(f"{path}: exists already; name another file, or replace it with overwrite=True")
-    with progress_bar(progress) as report, nullcontext() if overwrite else never_replaced(path):
+    with progress_bar(progress) as report:
         save_as(kind, scene, path, report)
 
 

@@ -15,7 +15,7 @@ from pointsplat_ns.compression.quality import decibels
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.outputs import need_folder
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.scene import save, source_file
 from pointsplat_ns.looking.sizes import size_text
@@ -132,9 +132,10 @@ def measure_tradeoff(
     targets = targets_of(target_db, target_ms, target_mb, keep, " ".join(sh), photos="photos" in tried)
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
-    with claimed_folder(folder), progress_bar(progress) as report:
-        if not force:
-            check_folder(folder)
+    need_folder(folder)
+    if not force:
+        check_folder(folder)
+    with progress_bar(progress) as report:
         own, trained = None if photos is None else Path(photos), "photos" in tried
         subject = subject_at(path, poses, resolution, up, data, own, report, trained)
         if trained and own is None:

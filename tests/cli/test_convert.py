@@ -27,6 +27,7 @@ def test_convert_writes_what_the_name_says_and_prints_its_size(scene, tmp_path, 
     said = capsys.readouterr().out
     size = sum(path.stat().st_size for path in (tmp_path / name).parent.iterdir() if path != scene)
     assert f"{tmp_path / name}: 400 Gaussians, SH degree 2, {bytes_text(size)}" in said
+    assert said.endswith(", in a new folder\n") == ("folder" in name)
     back = tmp_path / "back.ply"
     run("convert", tmp_path / name, back)
     assert same(ps.load(back), ps.load(tmp_path / name))

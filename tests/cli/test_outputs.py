@@ -1,19 +1,14 @@
 """Outputs: refused, replaced, interrupted."""
 
 import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import pointsplat_ns as ps
 from making import ball
-from pointsplat_ns import compacting
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
-from pointsplat_ns.io.outputs import claimed, claimed_folder
 
 FILES = (
     "prune damaged.ply -o OUT.ply",
@@ -51,54 +46,12 @@ def refusal(capsys, words: str) -> str:
 
 
 @pytest.mark.parametrize("words", (*FILES, *FOLDERS))
-def test_two_processes_do_not_write_one_output(words, here, capsys):
-    output = Path(next(word for word in words.split() if word.startswith("OUT")))
-    with claimed(output) if words in FILES else claimed_folder(output):
-        before = set(here.rglob("*"))
-        said = refusal(capsys, words)
-    assert said == f"error: {output}: another process is writing it; wait for it, or name another output\n"
-    assert set(here.rglob("*")) <= before, "something was left"
-
-
-def test_a_claim_ends_with_its_process_however_that_ends(here):
-    script = "import sys, time; from pathlib import Path; from pointsplat_ns.io.outputs import claimed\n"
-    script += "with claimed(Path('a/b.ply')):\n    print(flush=True); time.sleep(600)"
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None and process.stdout.readline()
-        with pytest.raises(ps.SceneError, match="a/b.ply: another process"), claimed(Path("a/b.ply")):
-            pass
-        process.send_signal(signal.SIGKILL)
-    assert [path.name for path in (here / "a").iterdir()] == [".b.ply.lock"]
-    with claimed(Path("a/b.ply")):
-        Path("a/b.ply").touch()
-    assert [path.name for path in (here / "a").iterdir()] == ["b.ply"]
-
-
-@pytest.mark.parametrize("links", [True, False])
-def test_a_file_that_appears_during_the_work_is_replaced_by_force_alone(links, monkeypatch, capsys):
-    ps.save(ball(40), "room.ply")
-    prune = compacting.prune_source
-
-    def meanwhile(*args, **options):
-        Path("small.ply").write_text("of another program")
-        return prune(*args, **options)
-
-    def no_link(*_):
-        raise PermissionError("no links here")
-
-    monkeypatch.setattr(compacting, "prune_source", meanwhile)
-    if not links:
-        monkeypatch.setattr(os, "link", no_link)
-    words = "prune room.ply --keep 50% --by opacity -o small.ply"
-    assert "small.ply: cannot be written (another file of this name has appeared meanwhile)" in refusal(capsys, words)
-    assert Path("small.ply").read_text() == "of another program"
-    main([*words.split(), "--force"])
-    assert len(ps.load("small.ply")) == 20
-    Path("small.ply").unlink()
-    monkeypatch.setattr(compacting, "prune_source", prune)
-    main(words.split())
-    assert len(ps.load("small.ply")) == 20
-    assert sorted(path.name for path in Path.cwd().iterdir()) == ["damaged.ply", "room.ply", "small.ply"]
+def test_a_place_that_takes_no_files_is_named_before_the_scene_is_read(words, here, capsys):
+    words = words.replace("OUT", "damaged.ply/OUT")
+    said = refusal(capsys, words)
+    output = next(word for word in words.split() if "OUT" in word)
+    assert said.startswith(f"error: {output}: cannot be written (") and said.count("\n") == 1
+    assert [path.name for path in here.iterdir()] == ["damaged.ply"]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def here(tmp_path, monkeypatch):
         ("a.json", ("render", "room.ply", "--path", "a.json"), "a.json: not a regular file"),
         ("a.safetensors", ("compact", *ROOM, "--refiner", "a.safetensors"), "a.safetensors: not a regular file"),
         ("a.ckpt", ("compact", *ROOM, "--refiner", "a.ckpt"), "a.ckpt: not a regular file"),
-        ("out/pointsplat-scenes.json", ("compact", ".", "-o", "out"), "out: cannot be used (not a regular file)"),
+        ("out/pointsplat-scenes.json", ("compact", ".", "-o", "out"), "pointsplat-scenes.json: cannot be read ("),
         ("out/tradeoff.json", ("tradeoff", "room.ply", "-o", "out"), "tradeoff.json: not the points of a sweep"),
         ("b.ply", ("prune", *ROOM, "-o", "b.ply", "--force"), "b.ply: not a regular file"),
         ("a", ("prune", *ROOM, "-o", "/dev/stdout"), "/dev/stdout: cannot write a nameless file"),

@@ -21,9 +21,7 @@ with open({log!r}, "a") as log:
 """
 
 COMMANDS = (
-    "prune scenes -o pruned --keep 4 --by paper --jobs 2",
     "compact scenes -o compacted --keep 4 --effort instant --jobs 2",
-    "convert scenes converted --to .spz --jobs 2",
     "prune scenes/1.ply -o merged.ply --keep 4",  # loads the kernels
 )
 """Commands that start processes."""

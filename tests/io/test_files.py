@@ -11,10 +11,9 @@ import pytest
 import pointsplat_ns as ps
 from making import cloud, normal_scene
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.folders import convert_folder
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
-from pointsplat_ns.io.files import never_replaced, replacing, write_csv
+from pointsplat_ns.io.files import replacing, write_csv
 from pointsplat_ns.io.scene import save, source_file
 
 
@@ -81,16 +80,6 @@ def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_file_that_is_not_to_be_replaced_may_be_again_afterwards(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text("old")
-    with never_replaced(path), pytest.raises(SceneError, match="appeared meanwhile"), replacing(path) as part:
-        part.write_text("new")
-    with replacing(path) as part:
-        part.write_text("newer")
-    assert path.read_text() == "newer"
-
-
 @pytest.mark.parametrize("name", ["a.ply", "meta.json"])
 def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     path = tmp_path / name
@@ -100,13 +89,6 @@ def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     assert len(ps.load(path)) == 3
     ps.save(cloud(4), path, overwrite=True)
     assert len(ps.load(path)) == 4
-
-
-def test_a_file_that_appears_while_a_scene_is_written_stays(tmp_path):
-    path = tmp_path / "a.spz"
-    with pytest.raises(SceneError, match="appeared meanwhile"):
-        ps.save(cloud(4), path, progress=lambda *told: path.write_bytes(b"of others"))
-    assert path.read_bytes() == b"of others"
 
 
 def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
@@ -188,14 +170,3 @@ def test_a_text_that_is_a_formula_gets_an_apostrophe(text, tmp_path):
     write_csv([{"name": text, "loss": -1.5, "note": "a=b", "none": None}], tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as stream:
         assert [*csv.DictReader(stream)] == [{"name": f"'{text}", "loss": "-1.5", "note": "a=b", "none": ""}]
-
-
-def test_links_among_the_tables_of_a_folder_are_not_written_through(tmp_path):
-    ps.save(normal_scene(4), tmp_path / "in" / "a.ply")
-    (tmp_path / "diary.txt").write_text("precious")
-    (tmp_path / "out").mkdir()
-    for name in ("scenes.csv", "a.ply.json"):
-        (tmp_path / "out" / name).symlink_to(tmp_path / "diary.txt")
-    (result,) = convert_folder(tmp_path / "in", tmp_path / "out", ".ply")
-    assert result.status == "done" and (tmp_path / "diary.txt").read_text() == "precious"
-    assert not any(path.is_symlink() for path in (tmp_path / "out").iterdir())

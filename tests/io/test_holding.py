@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import logging
 import math
 
 import pytest
@@ -10,7 +9,6 @@ import torch
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud
-from pointsplat_ns.folders import convert_folder
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within_colours
@@ -246,10 +244,3 @@ def test_splats_that_others_published_fit_into_every_format():
         for kind in WRITTEN:
             if kind.suffix != ".splat" or not scene.sh_degree:
                 assert losses(scene, kind.capacity) == [], (folder.name, kind.suffix)
-
-
-def test_a_folder_of_scenes_names_results_that_lose_something(tmp_path, caplog):
-    ps.save(in_units(cloud(30), 1e-3), tmp_path / "in" / "a.ply")
-    with caplog.at_level(logging.WARNING):
-        convert_folder(tmp_path / "in", tmp_path / "out", suffix=".spz")
-    assert loss_text(caplog).startswith(str(tmp_path / "out" / "a.spz"))

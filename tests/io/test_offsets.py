@@ -151,29 +151,6 @@ def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
         assert float(ps.psnr(ps.render(dense, given), ps.render(scene, views)).mean()) > 50
 
 
-def test_convert_recentres_and_sets_the_offset(tmp_path, capsys):
-    scene = cloud(200)
-    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "a.ply")
-    main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--recentre"])
-    back = ps.load(tmp_path / "b.ply")
-    assert back.offset == (1000.5, 1000.5, 1000.5) and float(back.means.abs().max()) < 1
-    assert "positions are relative to 1000.5 1000.5 1000.5" in capsys.readouterr().out
-    main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--offset", "0", "0", "0"])
-    assert "have lost their digits" not in capsys.readouterr().err
-    ps.save(scene.replace(offset=UTM), tmp_path / "utm.ply")
-    main(["convert", str(tmp_path / "utm.ply"), str(tmp_path / "far.ply"), "--offset", "0", "0", "0"])
-    assert "positions have lost their digits" in capsys.readouterr().err
-    back = ps.load(tmp_path / "c.ply")
-    assert back.offset is None and torch.allclose(back.means, scene.means + 1000, atol=1e-4)
-    main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "d.ply"), "--offset", "990", "1000", "-7.5"])
-    assert ps.load(tmp_path / "d.ply").offset == (990.0, 1000.0, -7.5)
-    with pytest.raises(SystemExit):
-        main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "e.ply"), "--recentre", "--offset", "0", "0", "0"])
-    assert "--recentre and --offset both given" in capsys.readouterr().err
-    main(["info", str(tmp_path / "b.ply")])
-    assert "positions are relative to 1000.5 1000.5 1000.5" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("extent", [0.0, 1e-300, 1e-3, 50.0, 1e9])
 def test_offsets_of_any_extent_leave_small_positions(extent):
     means = np.array(UTM) + extent * np.linspace(-1, 1, 11)[:, None]

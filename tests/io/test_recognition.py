@@ -108,15 +108,6 @@ def test_a_folder_is_searched_by_what_its_files_hold(tmp_path, contents, caplog)
     assert "d.ply: no Gaussians in it" in caplog.text
 
 
-def test_a_folder_of_renamed_files_is_written_as_what_they_are(tmp_path, contents):
-    """A scene that is smaller than the budget is copied, but not under a name that its bytes do not fit."""
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "a.splat").write_bytes(contents["SPZ 3"][0])
-    main(["prune", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--keep", "100"])
-    (made,) = (path for path in (tmp_path / "out").iterdir() if path.stem == "a" and path.suffix in (".spz", ".splat"))
-    assert made.suffix == ".spz" and made.read_bytes() == contents["SPZ 3"][0]
-
-
 REFUSED = {
     "x.ply": (
         zip_of(**{"document.json": "{}", "splat_0.ply": "ply\n"}),
