@@ -80,7 +80,7 @@ def _print_table(found: list[SceneInfo]) -> None:
     from pointsplat_ns.io.files import three_digits
     from pointsplat_ns.system.terminal import print_table
 
-    suffixes = [".ply", ".compressed.ply", ".spz", ".sog"]
+    suffixes = [".ply", ".spz", ".sog"]
     rows = []
     for one in found:
         sizes = [one.file_bytes.get(suffix, {}).get("100%") for suffix in suffixes]

@@ -42,7 +42,7 @@ def prune(
     they are sampled.
 
     Args:
-        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog or .splat. By
+        output: the file to write; its name says the format: .ply, .spz, .sog or .splat. By
             default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in a run's folder.
         keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of the file (12MB
             or 800kB; for .spz and .sog the count is searched for, which takes two or three times as long), or auto:35,

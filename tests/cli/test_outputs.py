@@ -79,7 +79,6 @@ def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words
 WRITES = {
     "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
     "room.spz": ("convert", "room.ply", "room.spz"),
-    "room.compressed.ply": ("convert", "room.ply", "room.compressed.ply"),
     "meta.json": ("convert", "room.ply", "meta.json"),
     "small.sog": ("compact", "room.ply", "--keep", "50%", "--effort", "instant", "-o", "small.sog"),
     "seen.png": ("prune", "room.ply", "--keep", "50%", "--by", "opacity", "--dry-run", "--plot", "seen.png"),

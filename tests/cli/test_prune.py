@@ -81,7 +81,7 @@ def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
     assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply"])
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_small_scene_stays_in_its_format_or_its_growth_is_said(suffix, ply, tmp_path, capsys):
     scene = tmp_path / f"small{suffix}"
     ps.save(read_ply(ply), scene)

@@ -10,13 +10,13 @@ import zlib
 
 import pytest
 import zstandard
+from compressed_plys import encode_compressed_ply
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.io.formats.compressed_ply import encode_compressed_ply
 from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.splat import encode_splat
 from pointsplat_ns.io.formats.spz import encode_spz

@@ -139,7 +139,7 @@ def scenes(draw):
     return ps.Gaussians(*(torch.from_numpy(table) for table in tables))
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".splat"])
 @given(scene=scenes())
 @QUICK
 def test_what_can_be_drawn_of_an_extreme_scene_is_written_and_read_back(tmp_path, suffix, scene):

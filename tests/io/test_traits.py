@@ -7,6 +7,7 @@ import json
 
 import pytest
 import torch
+from compressed_plys import encode_compressed_ply
 from spz4 import encode_spz4
 
 import pointsplat_ns as ps
@@ -62,17 +63,17 @@ def trained_so(scene):
 )
 def test_the_last_comment_of_a_ply_that_names_a_trait_counts(tmp_path, suffix, comments, traits, caplog):
     path = tmp_path / f"a{suffix}"
-    ps.save(cloud(3), path)
+    ps.save(cloud(3), path) if suffix == ".ply" else path.write_bytes(encode_compressed_ply(cloud(3)))
     assert ps.load(path).traits == Traits()
     lines = "".join(f"comment {comment}\n" for comment in comments).encode("latin-1")
     path.write_bytes(path.read_bytes().replace(b" 1.0\n", b" 1.0\n" + lines, 1))
     read = ps.load(path)
     assert read.traits == traits and ("drawn here as ordinary" in caplog.text) == ("SplatRenderMode: 2dgs" in comments)
-    ps.save(read, tmp_path / f"b{suffix}")
-    assert ps.load(tmp_path / f"b{suffix}").traits == traits
+    ps.save(read, tmp_path / "b.ply")
+    assert ps.load(tmp_path / "b.ply").traits == traits
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", "meta.json"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", "meta.json"])
 def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
     for scene in (cloud(20), trained_so(cloud(20))):
         ps.save(scene, named(tmp_path, suffix), overwrite=True)
@@ -89,7 +90,7 @@ def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, caplog):
     assert "the mark of antialiased training; .sog keeps it" in caplog.text
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".splat"])
 @pytest.mark.parametrize(("traits", "comment"), [(Traits(True), 29), (Traits(up="z"), 25), (Traits(True, "-y"), 55)])
 def test_the_size_of_a_file_is_known_to_the_byte_and_a_budget_holds(tmp_path, suffix, traits, comment):
     path, scene = tmp_path / f"a{suffix}", cloud(600).replace(antialiased=traits.antialiased, up=traits.up)

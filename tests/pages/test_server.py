@@ -171,7 +171,7 @@ def test_pictures_for_browsers_that_cannot_draw_are_renders(viewer):
     assert quick.shape == (48, 64, 3) and quick.std() > 10
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".sog"])
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     assert b"Drop a file here" in answer(empty, "GET", "/")[1]
     ps.save(ball(300), tmp_path / f"a{suffix}")

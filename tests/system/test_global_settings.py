@@ -140,7 +140,7 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     levels = ps.lod(room, ["50%", 60], views=views, folder=folder / "levels")
     found["levels"] = [[level.scene, level.errors] for level in levels]
     ps.lod(room, ["50%", 60], views=views, folder=folder / "stream", stream=True)
-    for suffix in (".ply", ".compressed.ply", ".spz", ".sog", ".splat"):
+    for suffix in (".ply", ".spz", ".sog", ".splat"):
         ps.save(room, folder / f"room{suffix}")
         found[suffix] = ps.load(folder / f"room{suffix}")
     found["info"] = ps.info(scene)

@@ -18,14 +18,9 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.io.formats import compressed_ply, rad, sog, splat, spz_range
+from pointsplat_ns.io.formats import sog, splat, spz_range
 from pointsplat_ns.io.formats.coding import morton_order
-from pointsplat_ns.io.formats.compressed_ply import (
-    compressed_ply_bytes,
-    encode_compressed_ply,
-    is_compressed,
-    read_compressed_ply,
-)
+from pointsplat_ns.io.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.io.formats.holding import Holds
 from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
@@ -98,10 +93,7 @@ _EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 
 FORMATS = (
     # Longer ends of names come before those that they end with; what several formats hold after what one holds.
-    Format(
-        "compressed PLY", ".compressed.ply", read_compressed_ply, writer(encode_compressed_ply), _PLY,
-        bytes_of=compressed_ply_bytes, capacity=compressed_ply.HOLDS, order=morton_order,
-    ),
+    Format("compressed PLY", ".compressed.ply", read_compressed_ply, starts=_PLY),
     Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes,
            capacity=Holds(offset=True)),
     Format(
@@ -131,7 +123,7 @@ FORMATS = (
     Format("ksplat", ".ksplat", instead=_CONVERT),
     Format("LCC", ".lcc", instead=_CONVERT), Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
-    Format("RAD", ".rad", instead=_EXPORT, capacity=rad.HOLDS),
+    Format("RAD", ".rad", instead=_EXPORT, capacity=Holds(antialiased=False)),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
     Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
     Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
@@ -209,11 +201,13 @@ def format_to_write(path: Path | str) -> Format:
 
 
 def format_like(path: Path) -> Format:
-    """The format to write what is made of a scene: that of the scene's file if it can be written, SOG for a SOG folder,
-    else PLY."""
+    """The format to write what is made of a scene: that of the scene's file if it can be written, SOG for a SOG folder
+    and a compressed PLY, else PLY."""
     if path.is_file() or path.is_dir():
         with suppress(SceneError):  # one that cannot be read, which its reader says
             kind = format_to_read(path)
+            if kind is not None and kind.read is read_compressed_ply:
+                return format_to_write(".sog")  # about as small
             if kind is not None and kind.write is not None:
                 return format_to_write(kind.budget_suffix)
     return format_to_write(".ply")

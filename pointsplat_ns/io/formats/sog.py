@@ -275,15 +275,7 @@ def _position_steps(scene: Gaussians) -> Tensor:
     return (torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())).amax(dim=1)
 
 
-HOLDS = Holds(
-    positions=Span(how=f"{_LEVELS.bit_length()} bits of log(1 + abs(x)), with its sign"),
-    sizes=Span(-30.0, how=f"{LEVELS} own numbers"),
-    colours=Span(how=f"{LEVELS} own numbers"),
-    opacities=Span(0.0, 1.0, 1 / 255),
-    rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 255),
-    sh=Span(how=f"{LEVELS} own numbers, {_MOST_ENTRIES:,} rows"),
-    position_steps=_position_steps,
-)
+HOLDS = Holds(sizes=Span(-30.0), position_steps=_position_steps)
 
 
 def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:

@@ -27,20 +27,13 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
-from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
+from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
-HOLDS = Holds(
-    sizes=FLOAT_SIZES,
-    colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)),
-    opacities=Span(0.0, 1.0, 1 / 255),
-    rotations=Span(-1.0, 127 / 128, 1 / 128),
-    sh=None,
-    antialiased=False,
-)
+HOLDS = Holds(colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)), sh=None, antialiased=False)
 
 
 def read_splat(path: Path | str) -> Gaussians:
