@@ -9,7 +9,6 @@ from compressed_plys import encode_compressed_ply
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.formats.sog import encode_sog, sog_bytes_like
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
@@ -43,14 +42,6 @@ def test_rows_of_a_file_that_cannot_be_drawn_are_counted_too(tmp_path):
     found = ps.info(tmp_path / "a.ply")
     assert found.gaussians == 10 and found.suspicious == {"NaN": 1}
     assert len(ps.load(tmp_path / "a.ply")) == 9
-
-
-@pytest.mark.parametrize("degree", [0, 2])
-def test_the_size_of_a_sog_file_is_estimated_from_a_part_of_a_scene(degree):
-    scene = cloud(25_000, 0, degree)
-    scene.means[:] = scene.means[:100].repeat_interleave(250, 0) + 0.01 * scene.means  # in clumps, as scenes are
-    real = len(encode_sog(scene))
-    assert sog_bytes_like(scene)(len(scene)) == pytest.approx(real, rel=0.1)  # 4 % seen, on scanned scenes up to 7 %
 
 
 def test_the_file_its_format_and_its_size_are_named(tmp_path):

@@ -43,7 +43,7 @@ def test_convert_cuts_turns_and_scales(scene, tmp_path, capsys):
 def test_info_prints_a_page_or_json(scene, capsys):
     run("info", scene)
     said = capsys.readouterr().out
-    assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said and ".sog" in said
+    assert "400 Gaussians of SH degree 2" in said and "suspicious: nothing" in said
     found = ps.info(scene)
     assert said.startswith(f"{scene}: 3DGS PLY, {bytes_text(scene.stat().st_size)}\n")
     assert f"\nup: {found.up_text}" in said and f"\nfill: {found.fill:.1f} Gaussians drawn per pixel, in 12 v" in said
@@ -64,7 +64,7 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
         assert (
             cells[:2] == [str(path), found.format] and cells[3] == f"{found.gaussians:,}" and cells[5] == found.up_text
         )
-        assert cells[-1] == three_digits(found.file_bytes[".sog"]["100%"] / 1e6)
+        assert cells[2] == three_digits(found.bytes / 1e6)
     run("info", scene, other, "--json")
     assert json.loads(capsys.readouterr().out) == [ps.info(path).as_dict() for path in (scene, other)]
     for words in ([], [scene, other, "--views", tmp_path / "sheet.png"]):

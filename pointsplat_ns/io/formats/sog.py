@@ -11,7 +11,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -38,12 +38,11 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.holding import Holds, Span
-from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
+from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.tensors import FLOATS
 
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
@@ -73,38 +72,6 @@ def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
             # The same scene gives the same bytes, whenever it is written.
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
     return stream.getvalue()
-
-
-def sog_bytes_like(scene: Gaussians) -> Callable[[int], int]:
-    """Estimates the size of a SOG file by its number of Gaussians, in a small part of the time of encoding it.
-
-    The images of 10,000 Gaussians are encoded without SH. Four pieces of the palette are made, 256 entries each, from
-    every second of the neighbours in SH of four Gaussians, as clusters are no balls. An index has as many bytes as its
-    bits fill.
-
-    Args:
-        scene: N > 0 Gaussians, float32 on the CPU.
-    """
-    sample = scene[:: -(-len(scene) // 10_000)]
-    parts = sog_parts(sample.replace(features_rest=sample.features_rest[:, :0]), silent)
-    fixed = len(parts.pop(META))
-    each = sum(map(len, parts.values())) / len(sample)
-    if not scene.sh_degree:
-        return lambda count: round(fixed + each * count)
-    rows, most = scene.features_rest.flatten(1), palette_size(len(scene))
-    members, pieces = min(round(256 * max(len(rows) / most, 1)), len(rows)), []
-    for middle in rows[torch.linspace(0, len(rows) - 1, 4, **FLOATS).long()]:
-        near = (rows - middle).square().sum(dim=1).topk(min(2 * members, len(rows)), largest=False).indices[::2]
-        pieces.append(palette(rows[near], lambda share: None, 256)[0])
-    pixels = codebook(torch.cat(pieces))[1].reshape(-1, 3).numpy()
-    entry = len(webp(pixels, _ACROSS * rows.shape[1] // 3, 1024 // _ACROSS)) / 1024
-
-    def size(count: int) -> int:
-        entries = min(palette_size(count), count)
-        indices = count * math.log2(max(entries, 1)) / 8
-        return round(1.5 * fixed + each * count + entry * entries + indices)  # SH add a codebook to two
-
-    return size
 
 
 def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) -> None:
