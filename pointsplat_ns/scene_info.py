@@ -15,7 +15,6 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.io.scene import kind_of, read_scene, source_parts
-from pointsplat_ns.io.usable import unusable_kept
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
@@ -105,8 +104,7 @@ def info(
     file, kind, bytes_ = "", "", 0
     if not isinstance(scene, Gaussians):
         file = str(scene)
-        with unusable_kept():
-            scene = read_scene(scene)
+        scene = read_scene(scene, all_rows=True)
         parts = source_parts(file)
         kind = kind_of(file)
         bytes_ = sum(part.stat().st_size for part in parts)

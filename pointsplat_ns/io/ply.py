@@ -31,7 +31,6 @@ from pointsplat_ns.io.ply_dialects import (
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
-from pointsplat_ns.io.usable import keep_usable
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -43,15 +42,13 @@ def read_ply(path: Path | str) -> Gaussians:
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
     Gaussians, which have no ``scale_2``, become flat ones. Names with CloudCompare's prefixes, colours as red, green
     and blue, and Mip-Splatting's 3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties
-    and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be drawn
-    (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
-    quaternion is the identity).
+    and elements, and bytes after the last element, are not read; a warning says so.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
     """
     rows = PlyRows(path, whole=True)
-    return keep_usable(rows.read(0, len(rows)), path)
+    return rows.read(0, len(rows))
 
 
 class PlyRows:

@@ -48,9 +48,10 @@ def is_folder_of_scenes(path: Path | str) -> bool:
     return path.is_dir() and not (path / RUN_FILES.config).is_file() and format_to_read(path) is None
 
 
-def read_scene(path: Path | str) -> Gaussians:
+def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
     """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a Splatfacto run.
 
+    Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
     Positions that are doubles far from the origin, as in geo-referenced PLYs, are read relative to an offset, which is
     that of the scene. Where float32 has lost their digits already, that is logged.
     The content of a file decides its format, else its name.
@@ -60,6 +61,7 @@ def read_scene(path: Path | str) -> Gaussians:
             SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, a checkpoint of
             Splatfacto (``.ckpt``) or gsplat (``.pt``), ``config.yml`` or a run's folder. The photos of a run are not
             needed.
+        all_rows: whether Gaussians that cannot be drawn are kept.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -82,6 +84,8 @@ def read_scene(path: Path | str) -> Gaussians:
     else:
         assert found.read is not None
         scene = found.read(path)
+    if not all_rows:
+        scene = keep_usable(scene, found.checkpoint if isinstance(found, Run) else path)
         warn_if_far(scene, path)
     return scene if run is None else scene.replace(antialiased=run.rasterize_mode == "antialiased")
 

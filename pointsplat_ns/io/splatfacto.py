@@ -18,7 +18,6 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import one_line, read_text, require_file, require_memory
-from pointsplat_ns.io.usable import keep_usable
 
 EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 
@@ -40,8 +39,7 @@ def read_checkpoint(path: Path | str) -> Gaussians:
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
     logits, they are converted to SH coefficients of the same colour. The ``cfg.yml`` of a training with gsplat says
-    whether it drew antialiased. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and
-    their number is logged.
+    whether it drew antialiased.
 
     Returns:
         The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the run's dataparser.
@@ -57,7 +55,7 @@ def read_checkpoint(path: Path | str) -> Gaussians:
         )
     found = open_checkpoint(path)
     antialiased = found.program == "gsplat" and _gsplat_antialiased(path)
-    return keep_usable(_scene_of(found, path).replace(antialiased=antialiased), path)
+    return _scene_of(found, path).replace(antialiased=antialiased)
 
 
 def open_checkpoint(path: Path) -> Checkpoint:

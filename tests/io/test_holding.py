@@ -217,9 +217,7 @@ def test_numbers_in_range_come_back_within_half_a_step(tmp_path, kind, degree, n
         (before.features_rest, after.features_rest), (before.alphas, after.alphas), (before.quats, turns),
     ]  # fmt: skip
     for index, ((one, other), step) in enumerate(zip(pairs, STEPS[kind.suffix], strict=True)):
-        if index == 2 and (
-            not other.numel() or (step is None and n > 500)
-        ):  # a palette has fewer entries than there are rows
+        if not other.numel() or (index == 2 and step is None and n > 500):  # a palette has fewer entries than rows
             continue
         wide = float(one.max() - one.min()) / 128 if step is None else step
         # The largest component of a rotation follows from the others, each off by half a step.

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io import read_ply, write_ply
+from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.ply_writing import column_names
 
 
@@ -43,7 +43,7 @@ def test_no_infinite_value_is_read_or_written_and_what_is_drawn_stays(tmp_path, 
     rows["opacity"][:2], rows["scale_1"][2] = (math.inf, -math.inf), -math.inf
     rows["scale_0"][3], rows["x"][4], rows["f_dc_2"][5], rows["rot_0"][6] = math.inf, math.nan, math.inf, -math.inf
     rewrite(tmp_path / "a.ply", rows)
-    found = read_ply(tmp_path / "a.ply")
+    found = read_scene(tmp_path / "a.ply")
     assert "dropped 4 of 8" in caplog.text and len(found) == 4
     assert all(bool(value.isfinite().all()) for value in found.tensors())
     assert found.alphas[:2].tolist() == pytest.approx([1.0, 0.0], abs=1e-12)
@@ -183,7 +183,7 @@ def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
     scene = normal_scene(20_000, 1)  # more than one chunk
     write_ply(scene, tmp_path / "a.ply")
     rewrite(tmp_path / "flat.ply", numpy.lib.recfunctions.drop_fields(rows_of(tmp_path / "a.ply"), "scale_2"))
-    flat = read_ply(tmp_path / "flat.ply")
+    flat = read_scene(tmp_path / "flat.ply")
     assert "2D Gaussians" in caplog.text and "scale_2" in caplog.text
     assert torch.equal(flat.scales[:, :2], scene.scales[:, :2]) and float(flat.stds[:, 2].max()) < 1e-30
     assert torch.equal(flat.quats, scene.quats) and torch.equal(flat.features_rest, scene.features_rest)

@@ -13,7 +13,7 @@ import torch
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io import read_checkpoint
+from pointsplat_ns.io import read_checkpoint, read_scene
 from pointsplat_ns.io.inert_yaml import Tagged, read_config
 
 
@@ -38,7 +38,7 @@ def test_colour_logits_of_degree_0_become_sh_of_the_same_colour(tmp_path, checkp
     # Splatfacto seeds white and black points with infinite logits in float32.
     logits = torch.tensor([[0.0, math.inf, -math.inf], [2.0, -3.0, 88.0]])
     torch.save(checkpoint_of(normal_scene(2, 0).replace(features_dc=logits)), tmp_path / "a.ckpt")
-    scene = read_checkpoint(tmp_path / "a.ckpt")
+    scene = read_scene(tmp_path / "a.ckpt")
     colours = 0.5 + SH_C0 * scene.features_dc
     # 2e-7: two roundings of float32 around values of at most 1
     assert torch.allclose(colours, torch.sigmoid(logits), atol=2e-7, rtol=0) and len(scene) == 2
@@ -50,7 +50,7 @@ def test_rows_without_meaning_are_dropped_counted_and_said(tmp_path, checkpoint_
     scene.opacities[0] = math.inf
     torch.save(checkpoint_of(scene), tmp_path / "a.ckpt")
     with caplog.at_level(logging.WARNING, "pointsplat_ns"):
-        found = read_checkpoint(tmp_path / "a.ckpt")
+        found = read_scene(tmp_path / "a.ckpt")
     scene.opacities[0] = 30.0  # sigmoid(30) is 1 in float32
     assert same_bits(scene[[0, 1, 2, 4]], found)
     assert caplog.messages == [f"{tmp_path / 'a.ckpt'}: dropped 1 of 5 Gaussians with NaN or infinite values"]

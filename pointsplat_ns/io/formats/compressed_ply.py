@@ -24,7 +24,6 @@ from pointsplat_ns.io.formats.coding import (
     scene_of,
 )
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
-from pointsplat_ns.io.usable import keep_usable
 
 CHUNK_GAUSSIANS = 256
 """Gaussians that share bounds."""
@@ -62,8 +61,7 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
         blocks = Blocks(load_bytes(path), path, header.size)
         data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
         scene = _decode(data["chunk"], data["vertex"], data.get("sh"), rest)
-        scene = scene.replace(**traits_of(header, path)._asdict())
-    return keep_usable(scene, path)
+        return scene.replace(**traits_of(header, path)._asdict())
 
 
 def _check(header: Header, chunk: Element, vertex: Element, sh: Element | None, path: Path) -> int:

@@ -41,7 +41,6 @@ from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
-from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 
 MAX_SIDE = 16_383
@@ -59,8 +58,7 @@ def read_sog(path: Path | str) -> Gaussians:
     declares more than it can hold."""
     path = Path(path)
     with damage_named(path, "SOG"), closing(Images(path)) as images:
-        scene = _decode(images, images.meta(), path)
-    return keep_usable(scene, path)
+        return _decode(images, images.meta(), path)
 
 
 def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:

@@ -35,7 +35,6 @@ from pointsplat_ns.io.formats.coding import (
 )
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.io.formats.spz_range import COLOUR_SCALE, MAX_FRACTION_BITS, SIZES, fitted, fraction_bits
-from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
 
 SH_BITS = (6, 5)
@@ -71,8 +70,7 @@ def read_spz(path: Path | str) -> Gaussians:
     if the file is of another kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
-        scene = decode_spz(load_bytes(path), path)
-    return keep_usable(scene, path)
+        return decode_spz(load_bytes(path), path)
 
 
 def decode_spz(data: bytes, path: Path) -> Gaussians:

@@ -21,7 +21,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.io.ply import read_ply
+from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
@@ -152,7 +152,7 @@ class PlyScene(DenseScene):
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the file, onto the CPU."""
-        return read_ply(self.source)
+        return read_scene(self.source)
 
     @cached_property
     def identity(self) -> str:
