@@ -26,8 +26,8 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
 def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
-    """The cameras in the JSON of a ``transforms.json``. Raises DataError if a frame has no usable pose or intrinsics, or
-    a camera has no focal length (a panorama)."""
+    """The cameras in the JSON of a ``transforms.json``. Raises DataError if a frame has no usable pose or intrinsics,
+    or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
     distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
