@@ -12,7 +12,6 @@ from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.goals import GOALS, GoalName, file_for, print_next, print_use
 from pointsplat_ns.cli.printing import (
     end_if_interrupted,
-    print_details,
     print_if_larger,
     print_json,
     print_result,
@@ -169,8 +168,8 @@ def compact(
     also += ["trained on photos"] * (result.last.photos is not None)
     print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
     print_if_larger(scene, written)
-    if verbose:
-        print_details(quality, dense, result.scene)
+    if verbose and quality is not None:
+        print(quality.details)
     if shown is not None:
         print(shown)
     print_use(goal, html, name_of(scene), quality)

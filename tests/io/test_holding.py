@@ -8,14 +8,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, cloud
+from making import cloud
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within_colours
 from pointsplat_ns.io.formats.spz_range import COLOURS, FARTHEST, SH, fraction_bits
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
-SPLATS = SHARED_DATA / "splats"
 WRITTEN = [kind for kind in FORMATS if kind.write is not None and kind.suffix != "meta.json"]
 
 
@@ -74,7 +73,7 @@ def test_spz_that_is_written_again_loses_no_position():
         assert torch.equal((read.means * 2**again).round() / 2**again, read.means)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("unit", [1e-3, 1e-5])
 def test_spz_names_sizes_that_it_cuts_and_the_format_that_keeps_them(tmp_path, caplog, unit):
     small = in_units(room(), unit)
     psnr_of_file(small, tmp_path / "a.spz", unit)
@@ -104,14 +103,6 @@ def test_spz_brings_a_handful_of_far_gaussians_in_and_counts_them(tmp_path, capl
         assert math.isclose(float(moved.abs().max()), FARTHEST / 4096, rel_tol=1e-5)
     angle = lambda of: of.stds[-3:, 0] / (of.means[-3:] - centre).norm(dim=1)  # noqa: E731
     assert torch.allclose(angle(back), angle(scene), rtol=1 / 30)  # half a step of log-scales
-
-
-def test_spz_leaves_far_gaussians_where_their_distance_costs_nothing(tmp_path, caplog):
-    scene = in_units(with_floaters(room()), 1 / 64)  # sizes grow again: blobs of 0.03 units, floaters at 800
-    scene = scene.replace(scales=scene.scales + math.log(64.0))
-    ps.save(scene, tmp_path / "a.spz")
-    assert not loss_text(caplog)
-    assert float((ps.load(tmp_path / "a.spz").means - scene.means).abs().max()) <= 2.0**-13
 
 
 def test_spz_names_coarse_positions_where_many_gaussians_are_far(tmp_path, caplog):
@@ -225,14 +216,3 @@ def test_numbers_in_range_come_back_within_half_a_step(tmp_path, kind, degree, n
         assert float((one - other).abs().max()) <= most, index
     steps = 0 if holds.position_steps is None else holds.position_steps(before)[:, None]
     assert bool(((before.means - after.means).abs() <= 0.51 * steps + 1e-6).all())
-
-
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
-def test_splats_that_others_published_fit_into_every_format():
-    names = [folder for folder in sorted(SPLATS.iterdir()) if folder.is_dir() and folder.name != "__pycache__"]
-    for folder in names:
-        files = [path for path in folder.iterdir() if path.suffix in (".ply", ".spz", ".sog")]
-        scene = ps.load(files[0] if files else folder).replace(antialiased=False)
-        for kind in WRITTEN:
-            if kind.suffix != ".splat" or not scene.sh_degree:
-                assert losses(scene, kind.capacity) == [], (folder.name, kind.suffix)

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 from compressed_plys import encode_compressed_ply
-from PIL import Image
 from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
-from pointsplat_ns.cli import main
 from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.offsets import offset_for
@@ -116,13 +114,6 @@ def test_float32_that_has_lost_its_digits_is_warned_of(tmp_path, caplog):
     assert not caplog.records
 
 
-def test_the_offset_survives_pruning_and_picking(tmp_path):
-    scene = ball(400).replace(offset=UTM)
-    assert scene[3].offset == UTM and scene.to(dtype=torch.float64).offset == UTM
-    assert ps.prune(scene, keep="50%", by="opacity").offset == UTM
-    assert ps.prune(scene, keep="50%").offset == UTM
-
-
 def test_turned_and_scaled_scenes_turn_and_scale_their_offset():
     scene = cloud(40).replace(offset=UTM)
     moved = ps.place(scene, up="z:y", scale=2.0)
@@ -161,23 +152,3 @@ def test_offsets_of_any_extent_leave_small_positions(extent):
     offset = offset_for(means, np.full((11, 3), -30.0))
     assert np.abs(means - offset).max() <= 3 * extent + 1e-9
     assert offset_for(np.full((3, 3), np.nan), np.zeros((3, 3))) is None
-
-
-def test_two_scenes_are_filmed_in_the_frame_of_the_first(tmp_path):
-    scene = ball(400)
-    one = scene.replace(offset=UTM)
-    other = one.at_offset((UTM[0] + 3, UTM[1], UTM[2] - 1))
-    views = ps.sample_views(scene, 1, width=64, height=48)
-    ps.render_path(one, tmp_path / "same", other=one, views=views, labels=[], fps=1)
-    ps.render_path(one, tmp_path / "moved", other=other, views=views, labels=[], fps=1)
-    frames = [min((tmp_path / folder).iterdir()) for folder in ("same", "moved")]
-    pictures = [np.asarray(Image.open(path), np.float64) for path in frames]
-    assert np.abs(pictures[0] - pictures[1]).max() <= 2
-
-
-def test_a_ply_that_is_pruned_in_parts_keeps_its_offset(tmp_path):
-    with_doubles(ball(4000, log_size=math.log(0.1)), tmp_path / "a.ply")
-    main(["prune", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.ply"), "--keep", "50%", "--memory", "4GB"])
-    whole, small = ps.load(tmp_path / "a.ply"), ps.load(tmp_path / "b.ply")
-    assert small.offset == whole.offset and len(small) == 2000
-    assert np.abs(np.median(absolute(small), axis=0) - np.median(absolute(whole), axis=0)).max() < 0.5

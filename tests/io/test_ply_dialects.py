@@ -84,11 +84,3 @@ def test_a_3d_filter_on_values_that_are_no_numbers_gives_none():
     assert wide[0].tolist() == [-inf, 0, 0] and found[0] == 1  # a flat axis stays flat without a filter
     assert wide[1, 0] == 0 and found[1] == -inf  # nothing of it is left
     assert found[2] == inf and found[3] == -inf and np.isnan(wide[4]).all()
-
-
-def test_a_3d_filter_of_2d_gaussians_leaves_them_flat(tmp_path):
-    scene = normal_scene(4, 0)
-    columns = {name: array for name, array in columns_of(scene).items() if name != "scale_2"}
-    found = ps.load(write_columns(tmp_path / "a.ply", {**columns, "filter_3D": np.full(4, 0.5, np.float32)}))
-    assert bool((found.scales[:, 2] == -87).all()) and bool((found.opacities > -20).all())
-    assert bool((found.scales[:, :2] > scene.scales[:, :2]).all())

@@ -63,10 +63,7 @@ def contents(tmp_path_factory):
     return scenes
 
 
-NAMES = [
-    "x.ply", "x.compressed.ply", "x.spz", "x.sog", "x.splat", "x.ckpt", "x.pt", "x.zip",
-    "x", "x.PLY", "x.bin", "x.yml", "x.las",
-]  # fmt: skip
+NAMES = ["x.ply", "x.spz", "x.splat", "x.ckpt", "x", "x.yml"]
 KINDS = {
     "SPZ 3": "SPZ", "SPZ 4": "SPZ", "checkpoint": "checkpoint of Splatfacto, step 7",
     "checkpoint of old torch": "checkpoint of Splatfacto, step 7",

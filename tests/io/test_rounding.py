@@ -17,7 +17,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write, spz
-from pointsplat_ns.io.formats.palette import codebook, palette
+from pointsplat_ns.io.formats.palette import codebook
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of, weights
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.merging.covariance import covariances, unpack
@@ -46,12 +46,6 @@ def values(scene: Gaussians) -> torch.Tensor:
         "pi,ij,pj->p", points, unpack(covariances(scene.scales.double(), scene.quats.double()))[0].inverse(), points
     )
     return (-0.5 * powers).exp()
-
-
-@pytest.mark.parametrize("psnr", [20.0, 40.0, 80.0, math.inf])
-def test_the_tolerance_is_a_share_of_the_error_that_there_is(psnr):
-    for sh_degree, share in ((0, ROUNDING.share_without_sh), (1, ROUNDING.share), (3, ROUNDING.share)):
-        assert rounding_for(psnr, sh_degree).tolerance == pytest.approx(share * 10 ** (-min(psnr, 45.0) / 20))
 
 
 @pytest.mark.parametrize(
@@ -152,15 +146,6 @@ def test_a_codebook_of_few_numbers_is_exact(values):
     book, index = codebook(values)
     assert book.shape == (256,) and index.dtype == torch.uint8
     assert torch.allclose(book[index.long()], values, atol=1e-6)
-
-
-def test_many_rows_are_stood_for_by_near_ones():
-    rows = rows_of(5000, 9)
-    shares = []
-    book, index = palette(rows, shares.append)
-    assert len(book) == 4096 and shares[-1] == 1.0
-    # Each centre holds about 17 rows and has about 14 entries: nearly every row one of its own.
-    assert float((book[index] - rows).square().mean()) < 0.5 * 0.01**2
 
 
 def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():

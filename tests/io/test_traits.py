@@ -13,15 +13,12 @@ from spz4 import encode_spz4
 import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.gaussians import Traits
-from pointsplat_ns.geometry.transforms import AXES, direction_of
-from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.io.turning import turned
-from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
 from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.pruning import Megabytes
 from pointsplat_ns.rasterizer.scene import pixels_of
 
 AXIS = "-x"
@@ -90,18 +87,6 @@ def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, caplog):
     assert "the mark of antialiased training; .sog keeps it" in caplog.text
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".splat"])
-@pytest.mark.parametrize(("traits", "comment"), [(Traits(True), 29), (Traits(up="z"), 25), (Traits(True, "-y"), 55)])
-def test_the_size_of_a_file_is_known_to_the_byte_and_a_budget_holds(tmp_path, suffix, traits, comment):
-    path, scene = tmp_path / f"a{suffix}", cloud(600).replace(antialiased=traits.antialiased, up=traits.up)
-    size = format_to_write(path).bytes_of
-    ps.save(scene[:400], path)
-    exact = size(400, 1, traits)
-    assert path.stat().st_size == exact == size(400, 1, Traits()) + (comment if "ply" in suffix else 0)
-    assert len(ps.prune(scene, Megabytes(exact / 1e6, suffix), by="coverage")) == 400
-    assert len(ps.prune(scene, Megabytes((exact - 1) / 1e6, suffix), by="coverage")) < 400
-
-
 def test_traits_stay_on_every_way_through_the_package():
     scene = trained_so(ball(400, 1)).replace(up="-x")
     half = scene[:200]
@@ -154,8 +139,7 @@ def test_other_axes_are_refused():
             cloud(3).replace(up=up)
 
 
-@pytest.mark.parametrize("old", AXES)
-@pytest.mark.parametrize("new", AXES)
+@pytest.mark.parametrize(("old", "new"), [("x", "-x"), ("z", "y"), ("-y", "z"), ("-z", "-z")])
 def test_the_axis_turns_with_the_scene(old, new, tmp_path):
     scene = cloud(20).replace(up=old)
     placed = ps.place(scene, up=new, scale=3.0)
@@ -190,9 +174,3 @@ def test_a_declared_axis_counts_as_a_named_one_wherever_up_counts(tmp_path, room
     assert torch.equal(path.views.viewmats, wanted.views.viewmats)
     page = ps.write_page(declared, tmp_path / "room.html")
     assert json.dumps({"up": up.direction.tolist()})[1:-1].replace(" ", "") in page.read_text().replace(" ", "")
-
-
-def test_another_named_axis_counts_more(room):
-    declared = room.replace(up=AXIS)
-    assert str(Sampler(declared, up=Up(direction_of("z"))).up) == "z"
-    assert same_bits(ps.prune(declared, 0.2, up="y"), ps.prune(room, 0.2, up="y"))

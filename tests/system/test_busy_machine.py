@@ -12,7 +12,7 @@ import torch
 
 from pointsplat_ns.system import cores as cores_module
 from pointsplat_ns.system.cores import FreeCores
-from pointsplat_ns.system.threads import fixed_threads, in_threads, most_threads, suitable_threads
+from pointsplat_ns.system.threads import fixed_threads, in_threads, suitable_threads
 from pretend_gpu import GPU
 
 
@@ -71,16 +71,6 @@ def test_as_many_threads_are_used_as_other_programs_leave_cores(machine, count, 
     assert used() == threads
 
 
-def test_what_this_process_uses_itself_is_free_to_it(machine):
-    machine.own_uses = 14.0
-    machine.others_use = 2.0
-    assert used() == 14
-    machine.own_uses = 16.0
-    machine.others_use = 0.0
-    machine.wait(1.0)
-    assert used() == 16
-
-
 def test_the_machine_is_looked_at_once_a_second_and_the_number_follows(machine):
     assert [used() for _ in range(5)] == [16] * 5
     looks = machine.looks
@@ -115,16 +105,6 @@ def test_where_the_system_does_not_say_what_is_used_all_cores_are_free(monkeypat
     assert cores_module._usage()[2:] == (3, 0.0)
 
 
-def test_the_callers_threads_are_restored_also_after_an_error(machine, caplog):
-    machine.others_use = 13.0
-    with pytest.raises(KeyboardInterrupt), suitable_threads():
-        assert torch.get_num_threads() == 3
-        raise KeyboardInterrupt
-    assert torch.get_num_threads() == 16 and most_threads() == 16
-    assert used() == 3
-    assert not caplog.records
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_nothing_is_chosen_where_the_user_has_or_on_a_gpu(machine, count):
     machine.others_use = 15.0
@@ -140,12 +120,6 @@ def test_pieces_that_do_not_wait_use_all_threads_in_a_step_on_one(machine):
     with suitable_threads():
         assert torch.get_num_threads() == 1
         in_threads(lambda item: meet.wait(30), range(4), torch.device("cpu"))
-
-
-def test_pieces_for_a_gpu_are_worked_on_in_the_thread_that_asks(machine):
-    threads = set()
-    in_threads(lambda item: threads.add(threading.get_ident()), range(8), GPU)
-    assert threads == {threading.get_ident()}
 
 
 def test_a_real_look_sees_this_process_work_and_changes_nothing():

@@ -20,7 +20,6 @@ from pointsplat_ns.compression import repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 from pointsplat_ns.system.kernels import KERNELS, Kernels
-from pointsplat_ns.system.tensors import FLAGS, FLOATS
 
 PACKAGE = Path(ps.__file__).parent
 
@@ -186,20 +185,3 @@ def test_kernels_are_tried_the_same_whatever_torchs_settings(setting):
     again.trials = KERNELS.trials
     with SETTINGS[setting]():
         assert again.why_missing == ""
-
-
-def test_a_network_is_float32_on_the_device_that_was_asked_for():
-    with default_type(torch.float64), default_device("meta"):
-        made = Refiner(preset("tiny"))
-        assert {(value.dtype, value.device.type) for value in made.parameters()} == {(torch.float32, "cpu")}
-        assert {value.device.type for value in Refiner(preset("tiny"), device="meta").parameters()} == {"meta"}
-
-
-def test_scenes_made_in_inference_mode_are_repaired_outside_of_it(usual, monkeypatch):
-    folder, _ = usual
-    with torch.inference_mode():
-        room = ps.load(folder / "scene.ply")
-        views = ps.sample_views(room, 3, width=48, height=36)
-    assert torch.ones(1, **FLAGS).is_inference() is False and torch.zeros(1, **FLOATS).requires_grad is False
-    compacted = ps.compact(room, 0.3, views=views)
-    assert compacted.repaired is not None and not compacted.scene.means.is_inference()

@@ -55,34 +55,6 @@ def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeyp
     assert called == [threading.get_ident()]
 
 
-def test_where_the_system_starts_no_more_threads_one_does_all(monkeypatch):
-    class Full(ThreadPoolExecutor):
-        def submit(self, *args):
-            raise RuntimeError("can't start new thread")
-
-    called = []
-    monkeypatch.setattr(kernels, "_pool", lambda process: Full(1))
-    with ThreadPoolExecutor(1) as other:
-        other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
-    kernels.on_threads(True, lambda _: called.append(None), threads=3)
-    assert len(called) == 2
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-def test_a_process_that_was_forked_has_threads_of_its_own():
-    code = """
-import os, sys
-from pointsplat_ns.system import kernels
-kernels._pool(os.getpid()).submit(int).result()
-child = os.fork()
-if child == 0:
-    os._exit(kernels._pool(os.getpid()).submit(int, 7).result(10))
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 7)
-"""
-    root = Path(kernels.__file__).parents[2]
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=root, timeout=120, check=True)
-
-
 PROGRAM = """
 import resource, sys
 import torch

@@ -97,8 +97,6 @@ def _saved_motion(content: dict[str, Any], path: Path) -> Motion:
     rows = content.get("applied_transform")
     if rows is None:
         rows = torch.eye(4, **FLOATS)[:3].tolist()
-        if (path.parent / "colmap" / "sparse" / "0").is_dir():  # as nerfstudio takes a file of an early version
-            rows = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
     scale = finite(content.get("applied_scale", 1.0))
     try:
         transform = torch.tensor(rows, **DOUBLES)
