@@ -39,7 +39,7 @@ class SceneInfo:
     file: str
     """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose size is 0."""
     format: str
-    """Name of the format; for a run or a checkpoint also the program or method, and the step."""
+    """Name of the format; for a run or a checkpoint in one its method and step."""
     bytes: int
     gaussians: int
     sh_degree: int

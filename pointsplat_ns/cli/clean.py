@@ -46,8 +46,7 @@ def clean(
     with fixed_threads(threads):
         dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
         ps.save(cleaned, output, progress=True, overwrite=True)
-        with options.scene_written(output):
-            quality = quality_of_file(dense, source, cleaned, output, suffix)
+        quality = quality_of_file(dense, source, cleaned, output, suffix)
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})

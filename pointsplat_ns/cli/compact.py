@@ -146,14 +146,13 @@ def compact(
         dense, result, source = compact_source(scene, request, targets, looking, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
-    with options.scene_written(written):
-        quality = quality_of_file(dense, source, result.scene, written, kind.budget_suffix)
-        if quality is not None:
-            quality = replace(quality, photos=result.photo_gain)
-        files = [_file_text(scene), "not written" if written is None else _file_text(written)]
-        shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
-        if html is not None:
-            _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
+    quality = quality_of_file(dense, source, result.scene, written, kind.budget_suffix)
+    if quality is not None:
+        quality = replace(quality, photos=result.photo_gain)
+    files = [_file_text(scene), "not written" if written is None else _file_text(written)]
+    shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
+    if html is not None:
+        _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
     if json_output:
         made = {
             "refined": result.accepted,

@@ -94,10 +94,9 @@ def prune(
             small, before = pruned, len(dense)
             if not dry_run:
                 ps.save(pruned, output, progress=True, overwrite=True)
-            with options.scene_written(written):
-                quality = quality_of_file(dense, source, pruned, written, suffix)
-                if plot is not None:
-                    ps.plot_distributions({"before": dense, "after": pruned}, plot)
+            quality = quality_of_file(dense, source, pruned, written, suffix)
+            if plot is not None:
+                ps.plot_distributions({"before": dense, "after": pruned}, plot)
         elif dry_run or plot is not None or photos is not False:
             raise ps.SceneError(f"{scene}: does not fit into memory; expected no --dry-run, --plot or --photos")
         else:

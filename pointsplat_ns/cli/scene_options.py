@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -135,19 +134,6 @@ def check_outputs(scene: Path | None, force: bool, png: Path | None = None, html
             files.append(path)
     for file in files:
         need_writable(file, force)
-
-
-@contextmanager
-def scene_written(output: Path | None) -> Iterator[None]:
-    """Let errors say that the scene has been written before, to ``output`` if that is not None."""
-    from pointsplat_ns.errors import PointSplatError
-
-    try:
-        yield
-    except PointSplatError as error:
-        if output is None:
-            raise
-        raise type(error)(f"{error}; the scene was written before, to {output}") from error
 
 
 def check_poses(poses: Path | None) -> None:

@@ -25,7 +25,7 @@ from pointsplat_ns.io.formats.holding import losses
 from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.offsets import warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
-from pointsplat_ns.io.splatfacto import open_checkpoint, read_checkpoint
+from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
@@ -115,8 +115,8 @@ def _run_around(path: Path, kind: Format) -> Run | None:
 
 
 def kind_of(path: Path | str) -> str:
-    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run or a checkpoint with
-    its program or method and its step. Raises SceneError as :func:`read_scene`.
+    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run or a checkpoint in
+    one with its method and step. Raises SceneError as :func:`read_scene`.
 
     Example:
         >>> from pathlib import Path
@@ -130,10 +130,8 @@ def kind_of(path: Path | str) -> str:
     if run is not None:
         what = "run" if found is run else "checkpoint"
         return f"{what} of {run.method_name or 'an unknown method'}, step {run.step}"
-    if isinstance(found, Format) and found.read is not read_checkpoint:
-        return found.name
-    opened = open_checkpoint(path)
-    return f"checkpoint of {opened.program}" + ("" if opened.step is None else f", step {opened.step}")
+    assert isinstance(found, Format)
+    return found.name
 
 
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:

@@ -22,18 +22,6 @@ from pointsplat_ns.io.files import one_line, read_text, require_file, require_me
 EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """The content of a checkpoint."""
-
-    program: str
-    """The program that saved it: Splatfacto or gsplat."""
-    step: int | None
-    """Steps of the training, as the program counts them; None if it does not say."""
-    values: dict[str, Any]
-    """The parameters by their names in :data:`~pointsplat_ns.gaussians.PARAMETERS`, each with its key in the file."""
-
-
 def read_checkpoint(path: Path | str) -> Gaussians:
     """Read the scene of a checkpoint of Splatfacto, or of gsplat's trainer.
 
@@ -53,18 +41,10 @@ def read_checkpoint(path: Path | str) -> Gaussians:
         raise SceneError(
             f"{path}: a part of a training on several GPUs; expected the whole scene; export a PLY with --save_ply"
         )
-    found = open_checkpoint(path)
-    antialiased = found.program == "gsplat" and _gsplat_antialiased(path)
-    return _scene_of(found, path).replace(antialiased=antialiased)
-
-
-def open_checkpoint(path: Path) -> Checkpoint:
-    """The content of a checkpoint, its tensors not yet checked. Raises SceneError as :func:`read_checkpoint`."""
     content = _load(path)
     if isinstance(content, dict) and isinstance(content.get("splats"), dict):  # of gsplat's simple_trainer
-        keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
-        values = {name: (key, content["splats"].get(key)) for name, key in keys.items()}
-        return Checkpoint("gsplat", _step(content.get("step")), values)
+        scene = _scene_of_gsplat(content["splats"], path)
+        return scene.replace(antialiased=_gsplat_antialiased(path))
     state = _pipeline_state(content, path)
     # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of distributed training.
     prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
@@ -74,11 +54,10 @@ def open_checkpoint(path: Path) -> Checkpoint:
             f"{path}: a checkpoint of another method; found the keys {_some(state, 4)}; "
             f"expected {prefixes[0]}means, as Splatfacto saves"
         )
-    return Checkpoint(
-        "Splatfacto",
-        _step(content.get("step")),
-        {name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS},
-    )
+    scene = _scene_of({name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS}, path)
+    if scene.sh_degree == 0:
+        scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
+    return scene
 
 
 def _gsplat_antialiased(path: Path) -> bool:
@@ -91,27 +70,26 @@ def _gsplat_antialiased(path: Path) -> bool:
     return re.search(r"^antialiased: true\s*$", text, re.M) is not None
 
 
-def _scene_of(found: Checkpoint, path: Path) -> Gaussians:
-    """The scene of a checkpoint's parameters, those that cannot be drawn included."""
+def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
+    """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
+    keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
+    held = {name: splats.get(key) for name, key in keys.items()}
+    if isinstance(opacities := held["opacities"], Tensor) and opacities.dim() == 1:
+        held["opacities"] = opacities[:, None]
+    if isinstance(dc := held["features_dc"], Tensor) and dc.dim() == 3 and dc.shape[1] == 1:
+        held["features_dc"] = dc[:, 0]
+    return _scene_of({name: (key, held[name]) for name, key in keys.items()}, path)
+
+
+def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
+    """The scene of parameters, each with its key in the file; those that cannot be drawn included."""
     limit = path.stat().st_size
-    held = (value for _, value in found.values.values())
-    require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
-    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in found.values.items()}
-    if found.program == "gsplat":  # opacities (N,), and constant SH coefficients (N, 1, 3)
-        opacities, dc = tensors["opacities"], tensors["features_dc"]
-        tensors["opacities"] = opacities[:, None] if opacities.dim() == 1 else opacities
-        tensors["features_dc"] = dc[:, 0] if dc.dim() == 3 and dc.shape[1] == 1 else dc
+    require_memory(path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value))))
+    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in values.items()}
     try:
-        scene = Gaussians(*(tensors[name] for name in PARAMETERS))
+        return Gaussians(*(tensors[name] for name in PARAMETERS))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
-    if found.program == "Splatfacto" and scene.sh_degree == 0:
-        scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
-    return scene
-
-
-def _step(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
 
 
 def _some(keys: Iterable[Any], count: int) -> str:

@@ -54,28 +54,6 @@ def test_a_place_that_takes_no_files_is_named_before_the_scene_is_read(words, he
     assert [path.name for path in here.iterdir()] == ["damaged.ply"]
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        ("compact room.ply --effort instant --html page.html", "shown.png: cannot be written (no reason)"),
-        ("compact room.ply --effort instant --picture shown.png", "shown.png: cannot be written (no reason)"),
-        ("prune room.ply --by opacity --plot shown.png", "shown.png: cannot be written (no reason)"),
-    ],
-)
-@pytest.mark.parametrize("dry", [False, True])
-def test_an_error_after_the_scene_was_written_says_where_the_scene_is(dry, words, reason, monkeypatch, capsys):
-    def failing(*_, **__):
-        raise ps.SceneError("shown.png: cannot be written (no reason)")
-
-    monkeypatch.setattr(ps, "plot_comparison", failing)
-    monkeypatch.setattr(ps, "plot_distributions", failing)
-    monkeypatch.setattr(ps, "write_page", failing)
-    ps.save(ball(40, opacity=1.0, bright=1.0), "room.ply")
-    said = refusal(capsys, words + " -o small.ply --keep 50%" + " --dry-run" * dry).splitlines()[-1]
-    assert said.startswith(f"error: {reason}") and Path("small.ply").exists() != dry
-    assert said.endswith("; the scene was written before, to small.ply") != dry
-
-
 WRITES = {
     "room_pruned.ply": ("prune", "room.ply", "--keep", "50%", "--by", "opacity"),
     "meta.json": ("convert", "room.ply", "meta.json"),
