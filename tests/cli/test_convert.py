@@ -74,21 +74,6 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
     assert not (tmp_path / "sheet.png").exists()
 
 
-def test_info_goes_on_after_a_file_that_is_no_scene(scene, tmp_path, capsys):
-    bad = tmp_path / "bad.ply"
-    bad.write_text("no scene")
-    for words in ([], ["--json"]):
-        with pytest.raises(SystemExit) as ended:
-            run("info", bad, scene, *words)
-        said = capsys.readouterr()
-        assert ended.value.code == 1 and str(bad) in said.err and "1 of 2 scenes cannot be read" in said.err
-        if words:
-            good, failed = json.loads(said.out)
-            assert good == ps.info(scene).as_dict() and failed["file"] == str(bad) and str(bad) in failed["error"]
-        else:
-            assert str(scene) in said.out and str(bad) not in said.out
-
-
 def test_info_draws_where_a_scene_is_looked_at_from(scene, tmp_path, capsys):
     sheet = tmp_path / "sheet.png"
     run("info", scene, "--views", sheet, "--resolution", "64x48")

@@ -85,16 +85,6 @@ def test_a_size_is_that_of_each_result_in_its_format(option, folder, tmp_path, c
     assert len({result["after"] for result in results}) == 3
 
 
-@pytest.mark.parametrize("sh", ["all", "0"])
-def test_a_scene_with_fewer_gaussians_than_asked_for_is_kept_whole_and_the_table_says_so(sh, folder, tmp_path, capsys):
-    ps.save(ps.load(folder / "room1.ply"), tmp_path / "scenes" / "few.sog")
-    ps.save(ball(300, opacity=1.0, bright=1.0), tmp_path / "scenes" / "many.ply")
-    run("compact", tmp_path / "scenes", "-o", tmp_path / "small", "--keep", "150", "--effort", "instant", "--sh", sh)
-    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "few 121 121" in said and ("kept whole" in said) == (sh == "all") and "many 300 150" in said
-    assert len(ps.load(tmp_path / "small" / "few.sog")) == 121
-
-
 @pytest.mark.parametrize(
     "words, said",
     [

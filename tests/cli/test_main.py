@@ -62,14 +62,6 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out == f"pointsplat-ns {ps.__version__}\n"
 
 
-def test_the_program_ends_at_once_with_all_that_was_registered_for_its_end_and_all_of_its_output():
-    code = (
-        "from pointsplat_ns.cli import program; import atexit; atexit.register(print, 'more'); program(); print('late')"
-    )
-    ended = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, f"pointsplat-ns {ps.__version__}\nmore\n", "")
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("where", ["full", "closed"])
 def test_output_that_nobody_can_take_ends_without_a_traceback(where):

@@ -12,12 +12,9 @@ from pointsplat_ns.compression import repair
 
 FILES = (
     "prune damaged.ply -o OUT.ply",
-    "prune damaged.ply -o a.ply --plot OUT.png",
     "compact damaged.ply -o OUT.spz",
-    "compact damaged.ply -o a.ply --picture OUT.png",
     "compact damaged.ply --dry-run --html OUT.html",
     "convert damaged.ply OUT.sog",
-    "export damaged.ply -o OUT.splat",
     "info damaged.ply --views OUT.png",
     "render damaged.ply -o OUT.mp4",
 )

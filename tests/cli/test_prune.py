@@ -15,7 +15,6 @@ from pointsplat_ns.cli import main
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.io.camera_files import read_views
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import METHODS, prune
 from posing import inria, written
@@ -166,16 +165,6 @@ def posed(tmp_path) -> tuple[Path, Path]:
     return tmp_path / "room.ply", written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
 
 
-def test_poses_of_a_file_are_looked_from(posed, tmp_path, capsys):
-    room, poses = posed
-    options = ("--keep", "20%", "--by", "lightgaussian", "--poses", poses, "--verbose")
-    run("prune", room, *options, "-o", tmp_path / "small.ply")
-    assert "5 views of 64 x 48 pixels (given views)" in capsys.readouterr().out
-    views = read_views(poses)
-    assert same(read_ply(tmp_path / "small.ply"), ps.prune(read_ply(room), "20%", "lightgaussian", views=views))
-    assert same(read_ply(tmp_path / "small.ply"), ps.prune(room, "20%", "lightgaussian", views=poses))
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(posed, tmp_path, capsys, suffix):
     room, poses = posed
@@ -197,19 +186,6 @@ def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.ply", "small.ply"]
     run("prune", scene, "--keep", "10%", "--memory", "8GB", "-o", tmp_path / "whole.ply")
     assert "not compared" not in capsys.readouterr().out
-
-
-def test_a_limit_of_memory_needs_a_binary_ply_and_writes_one(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0))
-    scene = normal_scene(900, degree=1, seed=SEED)
-    ps.save(scene, tmp_path / "scene.spz")
-    assert "expected a binary 3DGS PLY" in refusal(
-        capsys, tmp_path / "small.ply", "prune", tmp_path / "scene.spz", "--memory", "1GB"
-    )
-    write_ply(scene, tmp_path / "scene.ply")
-    assert "`pointsplat convert` changes" in refusal(
-        capsys, tmp_path / "small.spz", "prune", tmp_path / "scene.ply", "--memory", "200kB"
-    )
 
 
 def test_where_memory_is_short_a_scene_is_merged_in_parts_unasked(tmp_path, capsys, monkeypatch):

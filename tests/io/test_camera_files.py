@@ -52,13 +52,6 @@ def framed(**changes) -> dict:
     return content
 
 
-def turned(row: int, column: int, value: float) -> dict:
-    """A ``transforms.json`` of one frame, a number of whose pose is changed."""
-    rows = [list(line) for line in IDENTITY]
-    rows[row][column] = value
-    return framed(transform_matrix=rows)
-
-
 WRITERS = {
     "inria": lambda views, folder: written(inria(views), folder / "cameras.json"),
     "nerfstudio": lambda views, folder: written(nerfstudio(views), folder / "transforms.json"),
@@ -78,8 +71,7 @@ def test_cameras_are_those_that_were_written(kind, tmp_path):
 @pytest.mark.parametrize(
     ("model", "named"),
     [
-        ("sparse/0", "."), ("sparse/0", "sparse"), ("sparse", "."), ("colmap/sparse/0", "."),
-        ("colmap/sparse/0", "colmap"), ("0", "."), ("sparse/0", "sparse/0/images.bin"),
+        ("sparse/0", "."), ("sparse", "."), ("colmap/sparse/0", "."), ("sparse/0", "sparse/0/images.bin"),
     ],
 )  # fmt: skip
 def test_the_model_of_a_colmap_project_is_found_below_its_root(model, named, tmp_path):
@@ -192,17 +184,13 @@ def inria_with(**changes) -> list:
     ("content", "message"),
     [
         ("[" * 100_000, "cannot be read as JSON"),
-        ({}, "JSON without a list of cameras"),
         ({"camera_path": []}, "a camera path of nerfstudio's viewer, for `render --path`"),
         ([], "0 cameras; expected 1 to 100000"),
-        ([3], "camera 0 has no pose"),
         (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),
         (inria_with(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(fx=1e12), "camera 1 .* has no usable focal length"),
-        (inria_with(height=10**7), "camera 1 .* has a picture of no usable size"),
         ({"fl_x": 5, "w": 4, "h": 4, "frames": [3]}, "camera 0 is no frame"),
-        (turned(0, 3, math.inf), r"the pose of camera 0 (.*)?is no rigid motion"),
         (framed(cx=1e9), "camera 0 .* has its principal point far outside"),
         (framed(camera_model="EQUIRECTANGULAR"), "camera 0 is 'EQUIRECTANGULAR'; expected one of SIMPLE_PINHOLE"),
         ({**framed(), "applied_transform": [[1, 2]]}, "its 'applied_transform' or 'applied_scale' is not usable"),
@@ -262,18 +250,12 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
     [
         (colmap_texts("3 PINHOLE 64 48 50 50 30\n"), "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera"),
         (colmap_texts("3 EQUIRECTANGULAR 64 48 64 48\n"), "a camera of model EQUIRECTANGULAR; expected one of SIMPLE"),
-        (colmap_texts("4 PINHOLE 64 48 50 50 30 20\n"), "frame_0.png was taken by camera 3, which cameras.txt lacks"),
         (colmap_texts(None, "1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
-        (colmap_texts(None, "1 0 0 0 0 0 0 0 3 a.png\n\n"), "the pose of camera 0 .a.png. is no rigid motion"),
         (colmap_texts(None, "1 1 0 0 0 0 0 0 3 " + "a" * 10_000), "a line of more than 4096 bytes"),
         (colmap_bytes(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
         (colmap_bytes(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
-        (colmap_bytes(8 + 60, struct.pack("<I", 9)), "was taken by camera 9"),
         (colmap_bytes(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
-        (colmap_bytes(12, struct.pack("<i", -1), "cameras.bin"), "a camera of model -1; expected one of SIMPLE"),
-        (colmap_bytes(16, struct.pack("<Q", 2**64 - 1), "cameras.bin"), "has a picture of no usable size"),
         (colmap_bytes(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
-        (cut("images.bin", 0), "images.bin: ends too early"),
         (cut("images.bin", NAME_AT + 3), r"images.bin: says that it has 2 entries and has room for 0"),
     ],
 )

@@ -49,13 +49,6 @@ def test_an_offset_in_a_comment_adds_to_that_of_doubles(tmp_path):
     assert np.abs(absolute(ps.load(tmp_path / "a.ply")) - means - (100, 20, 3)).max() < 1e-6
 
 
-def test_doubles_near_the_origin_get_no_offset(tmp_path):
-    scene = cloud(300)
-    with_doubles(scene, tmp_path / "a.ply", origin=(0.0, 0.0, 3.0))
-    back = ps.load(tmp_path / "a.ply")
-    assert back.offset is None and np.allclose(absolute(back), scene.means.numpy() + [0, 0, 3], atol=1e-6)
-
-
 def test_a_geo_referenced_scene_is_drawn_as_at_its_origin(tmp_path):
     scene = ball(3000, log_size=math.log(0.06))
     with_doubles(scene, tmp_path / "a.ply")
@@ -95,12 +88,6 @@ def test_a_comment_that_is_no_offset_is_named_and_left_out(tmp_path, caplog, tex
     (tmp_path / "a.ply").write_bytes(data)
     assert ps.load(tmp_path / "a.ply").offset is None
     assert "no offset of three numbers" in caplog.text or not text
-
-
-@pytest.mark.parametrize("offset", [(1.0, 2.0), (1.0, float("nan"), 0.0)])
-def test_an_offset_that_is_no_point_is_refused(offset):
-    with pytest.raises(ps.SceneError, match="expected three finite numbers"):
-        cloud(3).replace(offset=offset)
 
 
 def test_float32_that_has_lost_its_digits_is_warned_of(tmp_path, caplog):

@@ -18,7 +18,7 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write, spz
 from pointsplat_ns.io.formats.palette import codebook
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of, weights
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.merging.covariance import covariances, unpack
 from pointsplat_ns.rasterizer import render
@@ -146,20 +146,6 @@ def test_a_codebook_of_few_numbers_is_exact(values):
     book, index = codebook(values)
     assert book.shape == (256,) and index.dtype == torch.uint8
     assert torch.allclose(book[index.long()], values, atol=1e-6)
-
-
-def test_a_palette_of_sh_has_as_many_entries_as_its_error_needs():
-    scene = cloud(4000, sh_degree=1).replace(features_rest=rows_of(4000, 9).reshape(4000, 3, 3))
-    errors, numbers = [], []
-    for tolerance in (0.1, 0.01, 1e-4):
-        rest = format_to_write(".sog").rounded(scene, Rounding(tolerance)).features_rest.flatten(1)
-        numbers.append(len(rest.unique(dim=0)))
-        each = weights(scene)
-        errors.append(
-            float((each @ (rest - rows_of(4000, 9)).double().square().sum(1) / each.sum() / 3).sqrt()) * SH_C0
-        )
-        assert errors[-1] < 1.1 * ROUNDING.palette_error * tolerance or numbers[-1] > 1000
-    assert 64 <= numbers[0] < numbers[1] < numbers[2] <= 2000 and errors[0] > errors[1] > errors[2]
 
 
 @pytest.mark.parametrize("different", [1, 300, 700])

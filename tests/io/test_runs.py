@@ -93,16 +93,6 @@ def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, 
     fails(lambda: find_runs(tmp_path / "none"), "no such folder")
 
 
-@pytest.mark.parametrize(
-    ("experiment", "name"), [("unnamed", "kitchen"), ("''", "kitchen"), ("a/b c", "a-b-c"), ("../..", "scene")]
-)
-def test_scene_names_fit_for_files(make_run, experiment, name):
-    folder = make_run()
-    text = (folder / "config.yml").read_text().replace("experiment_name: kitchen", f"experiment_name: {experiment}")
-    (folder / "config.yml").write_text(text)
-    assert scene_name(open_run(folder)) == name
-
-
 def test_every_kind_of_path_reads_the_same_scene(make_run, tmp_path):
     scene = normal_scene(6, 2)
     folder = make_run(scene=scene)

@@ -113,8 +113,6 @@ OTHER_METHOD = {"step": 1, "pipeline": {f"_model.field.mlp.{i}.weight": torch.ze
         *((some, ["expected a checkpoint that Splatfacto or gsplat saved"])
           for some in (b"", b"hello", b"PK", bytes(5000), b"\x80\x02}q\x00.")),
         ({"state_dict": {}, "epoch": 3}, ["not a checkpoint of a scene", "found epoch, state_dict"]),
-        ([1], ["not a checkpoint of a scene", "found list"]),
-        ({}, ["not a checkpoint of a scene", "found none"]),
         (OTHER_METHOD,
          ["another method", "_model.field.mlp.0.weight", "and 2 more", "_model.gauss_params.means"]),
     ],
@@ -131,7 +129,6 @@ def test_a_file_that_is_no_checkpoint_is_an_error_that_names_its_content(tmp_pat
         *((name, None, f"lacks the key '_model.gauss_params.{name}'")
           for name in ("scales", "quats", "opacities", "features_dc", "features_rest")),
         ("quats", torch.zeros(4, 3), "quats has shape (4, 3); expected (5, 4)"),
-        ("quats", torch.zeros(5, 4, dtype=torch.int64), "torch.int64"),
         ("quats", torch.zeros(5, 4).to_sparse(), "expected a dense floating-point tensor"),
         ("quats", [1.0], "is list"),
         ("quats", torch.zeros(1).expand(10**12, 4), "more than the file can hold"),
@@ -232,15 +229,9 @@ def nested(first, line, depth, *last):
         ("!!python/object:a.B\nmethod_name: &x [*x]", "holds itself"),
         (nested("{k: v}", "x{i}: &x{i} {{<<: [*x{before}, *x{before}]}}", 4), "merge keys are not supported at line 3"),
         (b"\xff\xfe\xff", "not a nerfstudio config.yml"),
-        ("a: [1, 2", "not a nerfstudio config.yml"),
         ("a: 1", "expected a saved trainer configuration"),
-        ("", "expected a saved trainer configuration"),
-        ("!!python/name:a.B ''", "expected a saved trainer configuration"),
-        ("&a !!python/object:a.B {x: *a}", "recursive"),
         ("!!python/object:a.B {? [1, 2] : 3}", "unhashable"),
-        ("!!python/object:a.B {x: " + "9" * 5000 + "}", "not a nerfstudio config.yml"),
         ("[" * 1500, "not a nerfstudio config.yml"),
-        ("\x00", "not a nerfstudio config.yml"),
         ("a" * (1 << 20) + "a", "1048577 bytes"),
     ],
 )

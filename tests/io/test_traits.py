@@ -14,7 +14,6 @@ import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.geometry.transforms import direction_of
-from pointsplat_ns.io.turning import turned
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
@@ -148,11 +147,6 @@ def test_the_axis_turns_with_the_scene(old, new, tmp_path):
     torch.testing.assert_close(placed.means.double() @ direction_of(new), 3 * height, rtol=0, atol=1e-5)
     ps.save(placed, tmp_path / "turned.ply")
     assert ps.load(tmp_path / "turned.ply").up == new
-
-
-def test_an_axis_that_is_none_after_a_turn_is_not_declared():
-    tilt = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6], [0.0, 0.6, 0.8]], dtype=torch.float64)
-    assert [turned(cloud(5).replace(up=up), tilt).up for up in ("x", "z", None)] == ["x", None, None]
 
 
 def test_a_declared_axis_counts_as_a_named_one_wherever_up_counts(tmp_path, room):

@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import importlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager
 from inspect import signature
@@ -19,7 +18,6 @@ from making import box_room, move_zero_layers
 from pointsplat_ns.compression import repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
-from pointsplat_ns.system.kernels import KERNELS, Kernels
 
 PACKAGE = Path(ps.__file__).parent
 
@@ -171,17 +169,3 @@ def test_the_api_gives_the_same_bits_whatever_torchs_settings(setting, usual):
     with SETTINGS[setting]():
         found = results_of(folder / "scene.ply", own)
     assert [name for name in {*wanted, *found} if found.get(name) != wanted.get(name)] == []
-
-
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_kernels_are_tried_the_same_whatever_torchs_settings(setting):
-    for path in PACKAGE.rglob("*.py"):
-        if "@KERNELS.tried_by" in path.read_text("utf-8"):
-            importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
-    if KERNELS.why_missing:
-        pytest.skip(f"no kernels: {KERNELS.why_missing}")
-    assert len(KERNELS.trials) == 6
-    again = Kernels()
-    again.trials = KERNELS.trials
-    with SETTINGS[setting]():
-        assert again.why_missing == ""
