@@ -179,8 +179,8 @@ def compact_folder(
     if os.path.realpath(folder) == os.path.realpath(target):
         raise SceneError(f"{target}: holds the scenes themselves; name another folder for the results")
     tasks = [
-        _Task(scene.name, scene.path, target / f"{scene.name}{target_format or format_like(scene.path).suffix}")
-        for scene in find_scenes(folder)
+        _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
+        for name, path in find_scenes(folder).items()
     ]
     _describe(target, options, force)
     drawn = (page, sheet) != (None, None)

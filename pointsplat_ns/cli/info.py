@@ -72,7 +72,7 @@ def _scenes_of(path: Path) -> list[Path]:
     from pointsplat_ns.io.discovery import find_scenes
     from pointsplat_ns.io.scene import is_folder_of_scenes
 
-    return [scene.path for scene in find_scenes(path)] if is_folder_of_scenes(path) else [path]
+    return [*find_scenes(path).values()] if is_folder_of_scenes(path) else [path]
 
 
 def _print_table(found: list[SceneInfo]) -> None:

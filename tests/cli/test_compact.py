@@ -124,7 +124,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
         assert (shown["name"], shown["amount"]) == ("my-room", "150 Gaussians")
         assert f"{page}: {bytes_text(page.stat().st_size)}, to " in said
     assert ('<iframe src="my%20room_web.html" title="my-room"' in said) == (goal == "web")
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["my room"]
+    assert [*find_scenes(tmp_path)] == ["my room"]
     run(
         "compact",
         "my room.ply",

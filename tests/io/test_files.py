@@ -120,7 +120,7 @@ def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, t
     (folder / "made" / FOLDER_FILES.scenes).touch()
     (folder / "points.ply").write_bytes(POINTS)
     (folder / "notes.txt").touch()
-    found = {scene.name: scene.path for scene in find_scenes(folder)}
+    found = find_scenes(folder)
     assert found == {
         "deep/er/HALL": folder / "deep/er/HALL.PLY",
         "hall": folder / "hall.ply",
@@ -148,7 +148,7 @@ def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):
         save(cloud(50, 0, 1), tmp_path / name)
     (tmp_path / "room_lod" / "lod.json").touch()
     (tmp_path / "room_tradeoff" / "tradeoff.json").touch()
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
+    assert [*find_scenes(tmp_path)] == ["deep/room_pruned", "other_compact", "room"]
     assert f"passed over {tmp_path / 'room_compact.spz'}: a result of {tmp_path / 'room'}" in caplog.text
 
 

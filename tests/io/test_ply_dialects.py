@@ -24,7 +24,7 @@ def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefi
     path = write_columns(tmp_path / "a.ply", {**columns, **colors, "scalar_Original_cloud_index": columns["x"]}, text)
     assert same_bits(ps.load(path), scene)
     assert "not read: the vertex properties red, green, blue, scalar_Original_cloud_index" in caplog.text
-    assert [found.path for found in find_scenes(tmp_path)] == [path]
+    assert [*find_scenes(tmp_path).values()] == [path]
 
 
 def test_a_name_that_is_there_with_and_without_a_prefix_is_read_without(tmp_path):

@@ -93,11 +93,11 @@ def test_a_folder_is_searched_by_what_its_files_hold(tmp_path, contents, caplog)
     (tmp_path / "a.ply").write_bytes(contents["SPZ 3"][0])
     (tmp_path / "b.splat").write_bytes(contents["3DGS PLY"][0])
     (tmp_path / "c.spz").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b"]
+    assert [*find_scenes(tmp_path)] == ["a", "b"]
     assert "c.spz: no Gaussians in it" in caplog.text
     (tmp_path / "d.ply").write_bytes(b"ply\n")
     (tmp_path / "e.sog").write_bytes(contents["SOG"][0][:-50])  # a scene that is damaged is none that is passed over
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["a", "b", "e"]
+    assert [*find_scenes(tmp_path)] == ["a", "b", "e"]
     assert "d.ply: no Gaussians in it" in caplog.text
 
 

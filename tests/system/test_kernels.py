@@ -2,8 +2,6 @@
 
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -53,35 +51,6 @@ def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeyp
     with ThreadPoolExecutor(1) as other, pytest.raises(SystemExit):
         other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
     assert called == [threading.get_ident()]
-
-
-PROGRAM = """
-import resource, sys
-import torch
-from pointsplat_ns.system.memory import keep_freed_memory
-kept = sys.argv[1] == "keep" and keep_freed_memory()
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    torch.ones(10_000_000) + 1  # two blocks of 40 MB, more than glibc ever keeps by itself
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-# The first rounds break up the memory that there is; later ones find their places.
-print(kept, min(faults() for _ in range(6)))
-"""
-
-
-def run(word: str) -> tuple[bool, int]:
-    out = subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
-    kept, faults = out.split()
-    return kept == "True", int(faults)
-
-
-def test_large_tensors_cost_new_pages_once():
-    kept, after = run("keep")
-    if not kept:
-        pytest.skip("not Linux with glibc, where there is nothing to do")
-    before = run("leave")[1]
-    # 80 MB are 19,500 pages of 4 kB; larger pages make fewer.
-    assert after < 0.1 * before
 
 
 @pytest.mark.parametrize("variable", [None, "7"])
