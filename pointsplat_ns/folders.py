@@ -294,7 +294,7 @@ class _Compacting:
         """Write a result and its record. A process killed in between leaves the record alone: the scene is open."""
         dense, kind = read_scene(task.source), format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
-        request, trained = dataclasses.replace(self.request, suffix=kind.budget_suffix), _loaded(self.refiner)
+        request, trained = dataclasses.replace(self.request, suffix=kind.suffix), _loaded(self.refiner)
         if self.targets is None:
             made = compact_scene(dense, CompactRequest(request, trained, self.repair), source)
         else:

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from compressed_plys import encode_compressed_ply
+from foreign import write_sog_folder
 
 import pointsplat_ns as ps
 from making import cloud
@@ -54,7 +55,7 @@ def test_the_file_its_format_and_its_size_are_named(tmp_path):
         assert (found.file, found.format, found.bytes) == (str(path), name, path.stat().st_size)
     (tmp_path / "named.ply").write_bytes(encode_compressed_ply(scene))
     assert ps.info(tmp_path / "named.ply").format == "compressed PLY"
-    ps.save(scene, tmp_path / "folder" / "meta.json")
+    write_sog_folder(scene, tmp_path / "folder")
     found = ps.info(tmp_path / "folder")
     parts = sum(part.stat().st_size for part in (tmp_path / "folder").iterdir())
     assert (found.format, found.bytes) == ("SOG folder", parts)

@@ -22,7 +22,8 @@ from PIL import Image
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.io.formats.sog import encode_sog
+from pointsplat_ns.io.scene import read_scene
 
 Read = Callable[[bytes], object]
 """Reads the bytes of one file, or raises."""
@@ -81,7 +82,8 @@ def _in_folder(path: Path) -> Gaussians:
 
 
 def _sog_folder(folder: Path) -> None:
-    save(some_scene(), folder / "meta.json")
+    with zipfile.ZipFile(io.BytesIO(encode_sog(some_scene()))) as archive:
+        archive.extractall(folder)
 
 
 def _gzipped(data: bytes) -> bytes:

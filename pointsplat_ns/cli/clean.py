@@ -42,7 +42,7 @@ def clean(
     options.check_poses(poses)
     output = output or options.output_beside(scene, "clean")
     options.check_outputs(output, force, picture)
-    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).budget_suffix
+    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).suffix
     with fixed_threads(threads):
         dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
         ps.save(cleaned, output, progress=True, overwrite=True)

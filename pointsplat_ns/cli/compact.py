@@ -138,7 +138,7 @@ def compact(
     options.check_outputs(written, force, picture, html)
     kind = format_to_write(output)
     request = CompactRequest.of(
-        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.budget_suffix
+        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.suffix
     )
     targets = targets_of(target_db, target_ms, target_mb, keep, sh, clean, seconds, bool(photos))
     looking = Looking(poses, resolution, up, data, photos)
@@ -146,7 +146,7 @@ def compact(
         dense, result, source = compact_source(scene, request, targets, looking, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
-    quality = quality_of_file(dense, source, result.scene, written, kind.budget_suffix)
+    quality = quality_of_file(dense, source, result.scene, written, kind.suffix)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)
     files = [_file_text(scene), "not written" if written is None else _file_text(written)]

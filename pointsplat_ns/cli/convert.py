@@ -28,8 +28,7 @@ def convert(
     Args:
         scene: a file of any format (.ply, .compressed.ply, .spz, .sog or its folder, .splat), a Splatfacto
             checkpoint, or a run (its folder or config.yml).
-        output: the file to write; its name says the format: .ply, .spz, .sog, meta.json (a SOG as a
-            folder) or .splat.
+        output: the file to write; its name says the format: .ply, .spz, .sog or .splat.
         sh: SH bands to keep: all, or up to a degree.
         up: the new up axis: x, y, z, -x, -y or -z. By default nothing is turned. The old up direction is estimated;
             -y:z names it as -y. Write --up=-y for a negative axis.

@@ -10,7 +10,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float,
         **({} if before is None else {"gaussians_before": before}),
         "gaussians": len(scene),
         "sh_degree": scene.sh_degree,
-        "bytes": ply_bytes(len(scene), scene.sh_degree) if where is None else file_bytes(where),
+        "bytes": ply_bytes(len(scene), scene.sh_degree) if where is None else where.stat().st_size,
         "seconds": seconds,
     }
 
@@ -92,7 +91,7 @@ def print_result(
 
 def print_if_larger(scene: Path, where: Path | None) -> None:
     """Print a note if a result takes more bytes than the scene's file, whose format has fewer for each Gaussian."""
-    if where is not None and scene.is_file() and scene.suffix != ".yml" and file_bytes(scene) < file_bytes(where):
+    if where is not None and scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
         remedy = "" if scene.suffix == where.suffix else f"; a name that ends in {scene.suffix} makes it smaller"
         print(f"note: {where} is larger than {scene}: {written_size(where)}, not {written_size(scene)}{remedy}")
 
@@ -108,4 +107,4 @@ def written_size(where: Path) -> str:
     """Size of a scene's file, in words."""
     from pointsplat_ns.io.files import bytes_text
 
-    return bytes_text(file_bytes(where))
+    return bytes_text(where.stat().st_size)

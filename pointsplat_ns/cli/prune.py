@@ -79,7 +79,7 @@ def prune(
     output = output or options.output_beside(scene, "pruned")
     written = None if dry_run else output
     options.check_outputs(written, force, plot)
-    suffix = format_to_write(output).budget_suffix
+    suffix = format_to_write(output).suffix
     request = PruneRequest(keep, by, sh, opacity_weight, clean, suffix)
     limit = None if memory is None else 1e6 * memory
     rows = rows_to_prune(scene, request, limit)

@@ -124,16 +124,13 @@ def check_outputs(scene: Path | None, force: bool, png: Path | None = None, html
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.outputs import need_suffix, need_writable
 
-    files = []
     if scene is not None:
         format_to_write(scene)
-        files += [scene.with_name(name) for name in _file_names(scene)]
     for path, kind in ((png, ".png"), (html, ".html")):
         if path is not None:
             need_suffix(path, kind)
-            files.append(path)
-    for file in files:
-        need_writable(file, force)
+    for path in filter(None, (scene, png, html)):
+        need_writable(path, force)
 
 
 def check_poses(poses: Path | None) -> None:
@@ -148,18 +145,6 @@ def check_poses(poses: Path | None) -> None:
         raise SceneError(
             f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own dataset need no --poses"
         )
-
-
-def file_bytes(path: Path) -> int:
-    """Size of a scene's file in bytes; for the meta.json of a SOG folder, of all parts together."""
-    return sum(part.stat().st_size for part in map(path.with_name, _file_names(path)) if part.exists())
-
-
-def _file_names(path: Path) -> tuple[str, ...]:
-    """Names of a scene's files: one, or for the meta.json of a SOG folder, all parts."""
-    from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
-
-    return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
 
 
 def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec:

@@ -137,9 +137,9 @@ def kind_of(path: Path | str) -> str:
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:
     """Write a scene in the format that the path's name asks for.
 
-    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits: ``.spz``
-    (version 3), ``.sog``, ``meta.json`` (the same in a folder) and ``.splat``. Gaussians that cannot be drawn (NaN, or
-    Inf where it is not valid) are left out, and their number is logged. The file appears whole or not at all.
+    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. ``.spz`` (version 3), ``.sog`` and
+    ``.splat`` keep fewer bits. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are left out, and
+    their number is logged. The file appears whole or not at all.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,

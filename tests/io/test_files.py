@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 
 import pytest
+from foreign import write_sog_folder
 
 import pointsplat_ns as ps
 from making import cloud, normal_scene
@@ -80,7 +81,7 @@ def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("name", ["a.ply", "meta.json"])
+@pytest.mark.parametrize("name", ["a.ply", "a.sog"])
 def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     path = tmp_path / name
     ps.save(cloud(3), path)
@@ -93,7 +94,7 @@ def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
 
 def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
     folder = tmp_path / "room"
-    ps.save(normal_scene(5), folder / "meta.json")
+    write_sog_folder(normal_scene(5), folder)
     source = source_file(folder)
     assert source.name == "room" and source == source_file(folder / "meta.json")
     assert source.bytes == sum(part.stat().st_size for part in folder.iterdir())

@@ -11,9 +11,9 @@ import zlib
 import pytest
 import zstandard
 from compressed_plys import encode_compressed_ply
+from foreign import encode_spz4
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import cloud

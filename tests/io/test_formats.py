@@ -5,8 +5,8 @@ import struct
 
 import numpy as np
 import pytest
+from foreign import encode_spz4, write_sog_folder
 from plys import columns_of, write_columns
-from spz4 import encode_spz4
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
@@ -40,7 +40,7 @@ def test_spz_4_is_read_as_spz_3_and_extensions_are_said_to_be_left_out(tmp_path,
 
 def test_a_sog_folder_is_read_by_both_names_and_equals_the_file(tmp_path):
     scene = cloud(1500, 0, 3)
-    ps.save(scene, tmp_path / "room" / "meta.json")
+    write_sog_folder(scene, tmp_path / "room")
     ps.save(scene, tmp_path / "room.sog")
     scenes = [ps.load(tmp_path / "room"), ps.load(tmp_path / "room" / "meta.json"), ps.load(tmp_path / "room.sog")]
     assert same_bits(scenes[0], scenes[1]) and same_bits(scenes[0], scenes[2])

@@ -15,7 +15,7 @@ from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within
 from pointsplat_ns.io.formats.spz_range import COLOURS, FARTHEST, SH, fraction_bits
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
-WRITTEN = [kind for kind in FORMATS if kind.write is not None and kind.suffix != "meta.json"]
+WRITTEN = [kind for kind in FORMATS if kind.write is not None]
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import zipfile
 import pytest
 import torch
 from compressed_plys import encode_compressed_ply
-from spz4 import encode_spz4
+from foreign import encode_spz4
 
 import pointsplat_ns as ps
 from making import cloud, same_bits, write_run

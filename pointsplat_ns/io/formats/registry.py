@@ -23,7 +23,7 @@ from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.io.formats.holding import Holds
 from pointsplat_ns.io.formats.rounding import Rounding
-from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
+from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog
 from pointsplat_ns.io.formats.sog_images import META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
@@ -63,11 +63,6 @@ class Format:
     """The range and the step of each attribute in its files."""
     order: Callable[[Gaussians], Tensor] | None = None
     """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
-
-    @property
-    def budget_suffix(self) -> str:
-        """Suffix of a size in a budget, such as ``.spz`` in 5MB.spz."""
-        return self.suffix if self.suffix.startswith(".") else ".sog"
 
     def fits(self, path: Path) -> bool:
         """Whether a file's name is one of this format."""
@@ -111,10 +106,7 @@ FORMATS = (
     ),
     Format("checkpoint", ".ckpt", read_checkpoint, starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",), holds="data.pkl"),
     Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.HOLDS),
-    Format(
-        "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog,
-        capacity=sog.HOLDS, order=morton_order,
-    ),
+    Format("SOG folder", META, read_sog),
     Format(
         "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
         capacity=splat.HOLDS, order=drawing_order,
@@ -206,8 +198,8 @@ def format_like(path: Path) -> Format:
     if path.is_file() or path.is_dir():
         with suppress(SceneError):  # one that cannot be read, which its reader says
             kind = format_to_read(path)
-            if kind is not None and kind.read is read_compressed_ply:
+            if kind is not None and kind.read in (read_compressed_ply, read_sog):
                 return format_to_write(".sog")  # about as small
             if kind is not None and kind.write is not None:
-                return format_to_write(kind.budget_suffix)
+                return kind
     return format_to_write(".ply")

@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.coding import (
     Array,
     bytes_of_logits,
@@ -70,21 +69,6 @@ def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
             # The same scene gives the same bytes, whenever it is written.
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
     return stream.getvalue()
-
-
-def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) -> None:
-    """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``.
-
-    All parts are written beside before the first replaces an older one. Meanwhile there is no ``meta.json``, so that a
-    folder with it is whole. Errors are those of :func:`encode_sog` and :func:`~pointsplat_ns.io.files.replacing`.
-    """
-    parts = sog_parts(scene, progress)
-    with ExitStack() as stack:
-        # Left in the opposite order: meta.json comes last.
-        for name in [META, *(name for name in parts if name != META)]:
-            size = sum(map(len, parts.values())) if name == META else 0
-            stack.enter_context(replacing(path.with_name(name), size)).write_bytes(parts[name])
-        path.with_name(META).unlink(missing_ok=True)
 
 
 def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:

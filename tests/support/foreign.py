@@ -1,11 +1,15 @@
-"""SPZ files of version 4, which are read and not written."""
+"""Files that are read and not written: SPZ of version 4, and SOG folders."""
 
 import gzip
+import io
 import struct
+import zipfile
+from pathlib import Path
 
 import zstandard
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.spz import encode_spz
 
 
@@ -20,3 +24,9 @@ def encode_spz4(scene: Gaussians, extensions: bytes = b"") -> bytes:
     head = struct.pack("<4sIIBBBB", magic, 4, n, degree, bits, flags | 2 * bool(extensions), len(parts))
     table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
     return b"".join([head, struct.pack("<I12x", 32 + len(extensions)), extensions, table, *streams])
+
+
+def write_sog_folder(scene: Gaussians, folder: Path) -> None:
+    """Unpack what a ``.sog`` file of a scene holds."""
+    with zipfile.ZipFile(io.BytesIO(encode_sog(scene))) as archive:
+        archive.extractall(folder)
