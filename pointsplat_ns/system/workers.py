@@ -41,7 +41,8 @@ class Workers(Generic[Item, Result]):
             context = get_context("spawn")
             ends, self._held = context.Pipe(duplex=False)
             function = pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
-            self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
+            with _started_safely(threads_for(self._jobs)):  # a pool starts multiprocessing's tracker of resources
+                self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
     def __exit__(self, *_: object) -> None:

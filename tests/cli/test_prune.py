@@ -13,7 +13,6 @@ import pointsplat_ns as ps
 from making import ball, normal_scene, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import prune_file
-from pointsplat_ns.compression.trained_refiner import open_refiner_run, scenes_of_run
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.pruning import METHODS, prune
@@ -115,7 +114,7 @@ def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, messa
     assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "damaged.ply", *options)
 
 
-@pytest.mark.parametrize("named", ["folder", "config", "ckpt", "ckpt seen from its folder"])
+@pytest.mark.parametrize("named", ["folder", "ckpt seen from its folder"])
 def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, splatfacto_run, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     shutil.copytree(splatfacto_run, folder)
@@ -126,35 +125,6 @@ def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named,
         monkeypatch.chdir(checkpoint.parent)
     run("prune", scene, "--keep", "10%", "--by", "opacity")
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
-
-
-@pytest.mark.parametrize("supervision", ["auto", "photos", "dense"])
-def test_export_knows_the_scenes_of_a_run_by_the_names_that_its_training_gave_them(
-    supervision, make_refined_run, trained_walls, tmp_path
-):
-    from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
-
-    shutil.copytree(trained_walls / "wall-b", tmp_path / "both" / "wall-b")
-    for folder in ("both", "plys"):
-        for i, name in enumerate(("wall-b.ply", "deep/point cloud.ply")):
-            write_ply(normal_scene(30 + i, seed=SEED), tmp_path / folder / name)
-    write_ply(normal_scene(20, seed=SEED), tmp_path / "plys.ply")
-    for data in ("both", "plys", "plys.ply"):
-        if supervision == "photos" and data != "both":
-            continue
-        _, scenes = training_scenes(tmp_path / data, supervision, MemoryCache(0), need_data=False)
-        run_folder = make_refined_run(tmp_path / f"of {data}", tmp_path / data, moved=0.5)
-        config = (run_folder / "config.yml").read_text()
-        assert "supervision: auto" in config
-        (run_folder / "config.yml").write_text(config.replace("supervision: auto", f"supervision: {supervision}"))
-        found, shown = scenes_of_run(open_refiner_run(run_folder, need_data=True))
-        assert list(found) == [scene.name for scene in scenes]
-        assert shown == scenes[0].name
-        for scene in scenes:
-            run("export", run_folder, "--scene", scene.name, "-o", tmp_path / "out.ply", "--force")
-            kept = prune(scene.read_dense(), 0.5, "paper")
-            assert same(read_ply(tmp_path / "out.ply"), kept.replace(opacities=kept.opacities + 0.5))
 
 
 @pytest.fixture()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import pytest
 import torch
@@ -14,10 +13,6 @@ import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.geometry.transforms import direction_of
-from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
-from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.rasterizer.scene import pixels_of
 
 AXIS = "-x"
@@ -147,24 +142,3 @@ def test_the_axis_turns_with_the_scene(old, new, tmp_path):
     torch.testing.assert_close(placed.means.double() @ direction_of(new), 3 * height, rtol=0, atol=1e-5)
     ps.save(placed, tmp_path / "turned.ply")
     assert ps.load(tmp_path / "turned.ply").up == new
-
-
-def test_a_declared_axis_counts_as_a_named_one_wherever_up_counts(tmp_path, room):
-    declared, up = room.replace(up=AXIS), Up(direction_of(AXIS))
-    ps.save(declared, tmp_path / "room.ply")
-    said = ps.info(tmp_path / "room.ply", resolution="64x48")
-    assert said.up == up.direction.tolist() and not said.up_is_guess
-    views = ps.sample_views(declared, 3, 64, 48)
-    assert torch.equal(views.viewmats, ps.sample_views(room, 3, 64, 48, up=up.direction).viewmats)
-    small = ps.prune(declared, 0.2)
-    assert same_bits(small, ps.prune(room, 0.2, up=AXIS)) and not same_bits(small, ps.prune(room, 0.2))
-    film = FilmSettings(64, 48, seconds=0.2)
-    for known in (None, ps.sample_views(room, 8, 64, 48)):
-        frame, named = FlightFrame.of(declared, known), FlightFrame.of(room, known, up)
-        assert str(frame.up) == AXIS and torch.equal(frame.views.viewmats, named.views.viewmats)
-    path, wanted = (
-        camera_path(scene, ViewSource(scene), None, film, up=axis) for scene, axis in ((declared, None), (room, up))
-    )
-    assert torch.equal(path.views.viewmats, wanted.views.viewmats)
-    page = ps.write_page(declared, tmp_path / "room.html")
-    assert json.dumps({"up": up.direction.tolist()})[1:-1].replace(" ", "") in page.read_text().replace(" ", "")
