@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
+from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.levels.folder import check_folder
@@ -58,7 +58,7 @@ def write_stream(
     if page is not None and page.turn is not None:
         scenes = [page.turn.apply(scene) for scene in scenes]
     if scenes:
-        warn_of_losses(format_to_write(SOG_META), scenes[0], folder)
+        warn_of_losses(format_to_write(".sog"), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
     with ExitStack() as stack:
