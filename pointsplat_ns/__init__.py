@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.filming import open_viewer, render_path
-    from pointsplat_ns.folders import compact_folder
+    from pointsplat_ns.folders import SceneResult, compact_folder
     from pointsplat_ns.gaussians import Gaussians
     from pointsplat_ns.io.scene import save
     from pointsplat_ns.levels.levels import Levels
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from pointsplat_ns.pages.scene_page import write_page
     from pointsplat_ns.placing import place
     from pointsplat_ns.rasterizer import rasterization, render
-    from pointsplat_ns.scene_folder import SceneResult
     from pointsplat_ns.scene_info import SceneInfo, info
     from pointsplat_ns.tradeoff.points import Tradeoff
     from pointsplat_ns.tradeoff.table import measure_tradeoff
@@ -55,12 +54,11 @@ _PUBLIC = {
     "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
     "pointsplat_ns.placing": ("place",),
     "pointsplat_ns.scene_info": ("SceneInfo", "info"),
-    "pointsplat_ns.scene_folder": ("SceneResult",),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
     "pointsplat_ns.pages.scene_page": ("write_page",),
     "pointsplat_ns.looking.sampling": ("sample_views",),
     "pointsplat_ns.errors": ("BudgetError", "DataError", "MissingPackageError", "PointSplatError", "SceneError"),
-    "pointsplat_ns.folders": ("compact_folder",),
+    "pointsplat_ns.folders": ("SceneResult", "compact_folder"),
     "pointsplat_ns.gaussians": ("Gaussians",),
     "pointsplat_ns.io.scene": ("save",),
     "pointsplat_ns.filming": ("open_viewer", "render_path"),

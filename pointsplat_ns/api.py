@@ -6,7 +6,6 @@ Each command of the command line calls one of these functions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 from pointsplat_ns.compacting import Looking, Source, compact_source, log, prune_source, read_source
@@ -40,10 +39,9 @@ def load(path: str | Path, scene: str | None = None, data: str | Path | None = N
     """Read a scene.
 
     Args:
-        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``,
-            ``.ksplat``, ``.glb``, a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS, a Splatfacto run (its
-            folder or ``config.yml``), or a ``pointsplat`` run, whose dense scene is then pruned and refined as in its
-            training.
+        path: a file of a scene (``.ply``, compressed or not, ``.spz``, ``.sog`` or its folder, ``.splat``), a
+            checkpoint of Splatfacto or gsplat, a Splatfacto run (its folder or ``config.yml``), or a ``pointsplat``
+            run, whose dense scene is then pruned and refined as in its training.
         scene: name of a scene of a ``pointsplat`` run; by default the first held-out one, or else the first.
         data: folder of the scenes of a ``pointsplat`` run, if they are no longer where the run says.
 
@@ -272,12 +270,11 @@ def lod(
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
     output = LevelOutput.of(folder, stream, tiles, at, up, force)
-    with ExitStack() as stack:
-        if output is not None:
-            stack.enter_context(output.claim(len(budgets)))
-        dense, view_source = read_source(scene, Looking(views, resolution, up, data))
-        source = None if isinstance(scene, Gaussians) else source_file(scene)
-        report = stack.enter_context(progress_bar(progress))
+    if output is not None:
+        output.check(len(budgets))
+    dense, view_source = read_source(scene, Looking(views, resolution, up, data))
+    source = None if isinstance(scene, Gaussians) else source_file(scene)
+    with progress_bar(progress) as report:
         made = make_levels(dense, levels, sh, view_source, source, report)
         made = made if output is None else output.write(made, report)
     log(made.notes)

@@ -50,8 +50,7 @@ class SceneError(PointSplatError):
         ... except ps.SceneError as error:
         ...     print(error)
         nowhere.ply: no such file; expected a scene (.compressed.ply, .ply, .spz, .sog, lod-meta.json, meta.json, \
-.ksplat, .splat, .glb, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a \
-Splatfacto run (its folder or config.yml)
+.splat), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or config.yml)
     """
 
 

@@ -1,44 +1,98 @@
-"""Commands on all scenes of a folder."""
+"""Compacts every scene of a folder, and writes a table of the results.
+
+The record of a result ``room.ply`` is ``room.ply.json``. A result is finished if its record has the hash of the input
+file with the options, and that of the result itself.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Sequence
+import glob
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
 from pointsplat_ns.compression.compact import compact_scene
-from pointsplat_ns.compression.prune import prune_scene
-from pointsplat_ns.compression.quality import judge_of
+from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
 from pointsplat_ns.compression.target_search import compact_to_psnr
 from pointsplat_ns.compression.trained_refiner import refiner_at
-from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.discovery import FOLDER_FILES
+from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
+from pointsplat_ns.io.files import (
+    content_hash,
+    json_text,
+    logger,
+    one_line,
+    read_text,
+    replacing,
+    require_memory,
+    write_csv,
+    write_json,
+)  # fmt: skip
 from pointsplat_ns.io.formats import format_like, format_to_write
-from pointsplat_ns.io.outputs import need_new, need_suffix
-from pointsplat_ns.io.scene import read_scene, source_file
+from pointsplat_ns.io.outputs import need_folder, need_new, need_suffix
+from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.looking.sizes import parse_resolution, size_text
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
-from pointsplat_ns.pages.gallery import draw_pair, write_gallery, write_sheet
-from pointsplat_ns.placing import place
-from pointsplat_ns.pruning import Keep, cut_sh
-from pointsplat_ns.scene_folder import (
-    Command,
-    CommandOptions,
-    SceneResult,
-    SmallerScene,
-    output_folder,
-    run_on_folder,
-)
-from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.pages.gallery import draw_pair, pair_of, write_gallery, write_sheet
+from pointsplat_ns.pruning import Keep
+from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
+from pointsplat_ns.system.workers import Workers, check_jobs
+
+FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
+"""Numbers of a result in its record."""
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """The result of one of many scenes.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> print(ps.SceneResult("hall", "hall.ply", "small/hall.ply", "done", psnr=28.0))
+        28.0 dB: edges of small things blur
+    """
+
+    name: str
+    """Path below the folder, without a suffix."""
+    source: str
+    """Path of the file or run."""
+    output: str
+    """Path of the result."""
+    status: Literal["done", "done before", "failed", "open"]  # ``done before``: by an earlier call; ``open``: not yet
+    before: int | None = None
+    """Gaussians of the scene."""
+    after: int | None = None
+    """Gaussians of the result."""
+    megabytes_before: float | None = None
+    """Size of the scene's file, 10^6 bytes."""
+    megabytes: float | None = None
+    """Size of the result, 10^6 bytes."""
+    psnr: float | None = None
+    """PSNR against the scene's own renders, dB; None if nothing was compared or they are equal."""
+    seconds: float | None = None
+    """Duration."""
+    error: str = ""
+    """The error in one line; empty if there was none."""
+    note: str = ""
+    """A remark on the result; empty if there is none."""
+
+    def __str__(self) -> str:
+        """What users read of a result."""
+        return "; ".join(filter(None, ("" if self.psnr is None else quality_line(self.psnr, None), self.note)))
 
 
 @normal_mode
@@ -65,26 +119,19 @@ def compact_folder(
 ) -> list[SceneResult]:
     """Compact every scene of a folder by :func:`compact`, and write the results to another folder.
 
-    Unchanged results of the same scene and options are kept, so another call continues an interrupted one. Several
-    calls may work on the same folders at the same time; one of them claims each scene.
+    Unchanged results of the same scene and options are kept, so another call continues an interrupted one.
 
     Args:
         folder: scenes are the files with Gaussians below it, and the newest Splatfacto run of each experiment.
         output: folder for ``NAME.ply`` and its record ``NAME.ply.json`` of each scene, and the table ``scenes.csv``;
             by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
             file, or is a PLY where that cannot be written.
-        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format. A scene with no more
-            Gaussians than a count is copied.
+        keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
         refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
-        by, sh, clean, effort: as for :func:`compact`.
-        seconds: duration of the repair of each scene, as for :func:`compact`.
-        target_db: as for :func:`compact`, for each scene in the format of its result.
-        resolution: as for :func:`prune`.
-        data: folder above the data of the runs, or that of one, where it is no longer where the runs say. A run whose
-            data is not found gets sampled views, and a note.
+        by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each scene.
+        data: folder above the data of the runs. A run whose data is not found gets sampled views, and a note.
         target_format: suffix of all results, such as ".sog"; by default each result has the format of its scene.
-        html: an .html file for a gallery of all scenes before and after, with links to their files. It is written at
-            the end, also after an interruption, from what is finished.
+        html: an .html file for a gallery of all scenes before and after, with links to their files; written at the end.
         picture: a .png file for the same pictures.
         jobs: number of processes, which share the cores. With more than one, the program must be a file whose main code
             is under ``if __name__ == "__main__":``, as for any Python program that starts processes.
@@ -92,175 +139,204 @@ def compact_folder(
         progress: True shows a bar; a function is called with the name of the current task and its share done.
 
     Returns:
-        The result of each scene, sorted by name. A failing scene does not stop the others; its status is
-        "failed".
+        The result of each scene, sorted by name. One that fails has the status "failed" and does not stop the others.
 
     Raises:
-        BudgetError, PointSplatError: if an option is not valid.
-        DataError: if the number of jobs is not valid.
-        SceneError: if there is no scene, the output folder holds other results, or a page or picture that an earlier
-            call did not write is there.
+        PointSplatError: if an option is not valid.
+        SceneError: if there is no scene, or the output folder, page or picture is one of other results.
 
     Example:
         >>> import tempfile
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     for every in (100, 200):
-        ...         ps.save(ps.example_room()[::every], f"{folder}/rooms/{every}.ply")
-        ...     results = ps.compact_folder(f"{folder}/rooms", keep=50, effort="instant")
-        >>> [(result.name, result.status, result.before, result.after) for result in results]
-        [('100', 'done', 629, 50), ('200', 'done', 315, 50)]
+        ...     ps.save(ps.example_room()[::100], f"{folder}/rooms/hall.ply")
+        ...     [result] = ps.compact_folder(f"{folder}/rooms", keep=50, effort="instant")
+        >>> result.name, result.status, result.before, result.after
+        ('hall', 'done', 629, 50)
     """
     folder = Path(folder)
-    target = output_folder(folder, "compact") if output is None else Path(output)
+    target = output_folder(folder) if output is None else Path(output)
     size, trained = parse_resolution(resolution), _loaded(refiner)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db)
-    make = _Compacting(request.prune, size, data, target_format, refiner, request.repair, target_db)
-    options = {
-        **make.options(),
-        "refiner": None if trained is None else source_file(trained.source).sha256,
-        "effort": effort if seconds is None else None,
-        "seconds": seconds,
-        **({} if target_format is None else {"format": target_format}),
-    }
-    if target_db is not None:
-        options |= {"keep": None, "target_db": target_db}
+    options: dict[str, str | float | bool | None] = {
+        "keep": str(request.prune.budget), "by": request.prune.by, "sh": sh, "clean": clean, "effort": effort,
+        "seconds": seconds, "target_db": target_db, "resolution": None if size is None else size_text(size),
+        "data": None if data is None else str(data),
+        "refiner": None if trained is None else source_file(trained.source).sha256, "format": target_format,
+    }  # fmt: skip
+    check_jobs(jobs)
     page, sheet = (None if path is None else Path(path) for path in (html, picture))
-    again = force or (target / FOLDER_FILES.scenes).exists()
-    for path, end in ((page, ".html"), (sheet, ".png")):
-        if path is not None:
-            need_suffix(path, end)
-            need_new(path, again)
-
-    def show(results: Sequence[SceneResult]) -> None:
+    for shown, end in ((page, ".html"), (sheet, ".png")):
+        if shown is not None:
+            need_suffix(shown, end)
+            need_new(shown, force or (target / FOLDER_FILES.scenes).exists())
+    if os.path.realpath(folder) == os.path.realpath(target):
+        raise SceneError(f"{target}: holds the scenes themselves; name another folder for the results")
+    tasks = [
+        _Task(name, path, target / f"{name}{target_format or format_like(path).suffix}")
+        for name, path in find_scenes(folder).items()
+    ]
+    _describe(target, options, force)
+    drawn = (page, sheet) != (None, None)
+    work = _Compacting(request.prune, request.repair, target_db, refiner, size, data, options, drawn, force)
+    results: dict[str, SceneResult] = {}
+    try:
+        with progress_bar(progress) as report, Workers(work, jobs) as workers:
+            report("compact", 0.0)
+            for task, result in workers.results(tasks):
+                results[task.name] = result
+                report("compact", len(results) / len(tasks))
+                if result.status == "failed":
+                    logger.warning("%s failed: %s", result.name, result.error)
+    finally:  # also after an interruption
+        for task in tasks:
+            if task.name not in results:  # its process may have ended while it wrote
+                for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
+                    part.unlink(missing_ok=True)
+        rows = [results.get(task.name) or _known(task) for task in tasks]
+        write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
         if page is not None:
-            write_gallery(page, folder.resolve().name, results)
+            write_gallery(page, folder.resolve().name, rows)
         if sheet is not None:
-            write_sheet(sheet, results)
-
-    draw = functools.partial(_drawn, data) if page or sheet else None
-    command = Command("compact", make, options, target_format, draw)
-    return run_on_folder(folder, target, command, jobs, force, progress, show)
+            write_sheet(sheet, rows)
+    return rows
 
 
-def prune_folder(
-    folder: Path,
-    output: Path,
-    request: PruneRequest,
-    resolution: tuple[int, int] | str | None = None,
-    data: str | Path | None = None,
-    jobs: int = 1,
-    force: bool = False,
-    progress: bool | Progress = False,
-) -> list[SceneResult]:
-    """Prune every scene of a folder by :func:`prune`; folders, sizes and results as of :func:`compact_folder`."""
-    pruning = _Pruning(request, parse_resolution(resolution), data, None)
-    options = {**pruning.options(), "opacity_weight": request.opacity_weight}
-    return run_on_folder(folder, output, Command("prune", pruning, options), jobs, force, progress)
-
-
-def convert_folder(
-    folder: Path,
-    output: Path,
-    suffix: str,
-    *,
-    sh: str = "all",
-    up: str | None = None,
-    scale: float = 1.0,
-    original_frame: bool = False,
-    offset: Sequence[float] | Literal["centre"] | None = None,
-    jobs: int = 1,
-    force: bool = False,
-    progress: bool | Progress = False,
-) -> list[SceneResult]:
-    """Write every scene of a folder in another format, named by its suffix, such as ".spz"; otherwise as
-    :func:`compact_folder`. Raises SceneError if the format is not written as one file."""
-    if not suffix.startswith(".") or format_to_write(suffix).suffix != suffix:
-        raise SceneError(f"{suffix}: no suffix of scene files that are written; expected one such as .spz")
-    options: CommandOptions = {
-        **{"format": suffix, "sh": sh, "up": up, "scale": scale, "original_frame": original_frame},
-        **({} if offset is None else {"offset": str(offset)}),
-    }
-    command = Command("convert", functools.partial(_converted, sh, up, scale, original_frame, offset), options, suffix)
-    return run_on_folder(folder, output, command, jobs, force, progress)
+def output_folder(folder: Path) -> Path:
+    """The default output folder, beside a folder: ``scenes_compact`` for ``scenes``."""
+    place = Path(os.path.abspath(folder))
+    return place.with_name(f"{place.name}_compact")
 
 
 _loaded = functools.cache(refiner_at)
 
 
 @dataclass(frozen=True)
-class _Pruning:
-    """Prunes the scenes of a folder. It is pickled for other processes."""
+class _Task:
+    """A scene to work on, and the file to write."""
 
-    request: PruneRequest
-    resolution: tuple[int, int] | None
-    data: str | Path | None
-    suffix: str | None
-    """Suffix of the results; None for the format of each scene."""
+    name: str
+    source: Path
+    output: Path
 
-    def options(self) -> dict[str, str | float | bool | None]:
-        """All options that a result depends on."""
-        request, size, data = self.request, self.resolution, self.data
-        return {
-            "keep": str(request.budget),
-            "by": request.by,
-            "sh": request.sh,
-            "clean": request.clean,
-            "resolution": None if size is None else size_text(size),
-            **({} if data is None else {"data": str(data)}),
-        }
+    def result(self, status: Literal["done", "done before", "failed", "open"], **facts: Any) -> SceneResult:
+        return SceneResult(self.name, str(self.source), str(self.output), status, **facts)
 
-    def __call__(self, dense: Gaussians, path: Path) -> SmallerScene:
-        """Make one scene smaller."""
-        source = view_source(dense, run=path, data=self.data, resolution=self.resolution)
-        kind = format_like(path) if self.suffix is None else format_to_write(self.suffix)
-        scene = self.smaller(dense, replace(self.request, suffix=kind.budget_suffix), source, path)
-        whole = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
-        whole = whole and all(map(torch.equal, scene.tensors(), dense.tensors()))
-        note = "kept whole" if whole else source.missing[2:-1]
-        judge = None if whole and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
-        return SmallerScene(scene, judge, note, same=whole and isinstance(self.request.budget, int))
+    @property
+    def record(self) -> Path:
+        """The file with the figures and hashes of the result."""
+        return self.output.with_name(f"{self.output.name}.json")
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource, path: Path) -> Gaussians:
-        """The smaller scene."""
-        return prune_scene(dense, request, source).scene
+
+def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
+    """Write the options beside the results. Raises SceneError if the output is no folder, or holds results of other
+    options."""
+    need_folder(output)
+    path, text = output / FOLDER_FILES.scenes, json_text(options) + "\n"
+    try:
+        other = path.exists() and read_text(path) != text
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: cannot be read ({one_line(error)}); name another folder for the results") from error
+    if other and not force:
+        raise SceneError(
+            f"{output}: holds results of other options, see {path.name}; name another folder, or overwrite them with "
+            "--force"
+        )
+    write_json(options, path)
 
 
 @dataclass(frozen=True)
-class _Compacting(_Pruning):
-    """Compacts the scenes of a folder."""
+class _Compacting:
+    """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
 
-    refiner: str | Path | None
-    """Loaded by each process."""
+    request: PruneRequest
     repair: RepairBudget
     target_db: float | None
+    refiner: str | Path | None  # loaded by each process
+    resolution: tuple[int, int] | None
+    data: str | Path | None
+    options: Mapping[str, Any]
+    drawn: bool  # whether a picture of each scene before and after is wanted
+    force: bool
 
-    def smaller(self, dense: Gaussians, request: PruneRequest, source: ViewSource, path: Path) -> Gaussians:
-        """The compact scene."""
-        whole = CompactRequest(request, _loaded(self.refiner), self.repair, target_db=self.target_db)
-        result = (compact_scene if self.target_db is None else compact_to_psnr)(dense, whole, source)
-        if result.interrupted:
+    def __call__(self, task: _Task) -> SceneResult:
+        """The result of a scene. An error gives one with the status ``failed``, and leaves no file."""
+        start = time.perf_counter()
+        try:
+            for part in source_parts(task.source):
+                require_memory(part, part.stat().st_size)  # before hours of hashing a sparse file
+            source = source_file(task.source)
+            text = json.dumps([source.sha256, self.options], sort_keys=True)
+            key = hashlib.sha256(text.encode()).hexdigest()
+            record = _read_record(task)
+            whole = record is not None and task.output.is_file() and content_hash(task.output) == record["sha256"]
+            if not whole and os.path.lexists(task.output) and not self.force:
+                raise SceneError(
+                    f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
+                    "name another folder, or overwrite it with --force"
+                )
+            finished = record is not None and whole and record["key"] == key
+            result = _known(task) if finished else self._make(task, source.bytes, key, start)
+            if self.drawn and not pair_of(task.output).exists():
+                self._draw(task)
+            return result
+        except Exception as error:  # one scene must not stop the others
+            kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
+            return task.result("failed", seconds=time.perf_counter() - start, error=kind + one_line(error, limit=1000))
+
+    def _make(self, task: _Task, source_bytes: int, key: str, start: float) -> SceneResult:
+        """Write a result and its record. A process killed in between leaves the record alone: the scene is open."""
+        dense, kind = read_scene(task.source), format_to_write(task.output)
+        source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
+        request, trained = dataclasses.replace(self.request, suffix=kind.suffix), _loaded(self.refiner)
+        whole = CompactRequest(request, trained, self.repair, target_db=self.target_db)
+        made = (compact_scene if self.target_db is None else compact_to_psnr)(dense, whole, source)
+        if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
-        return result.scene
+        scene = made.scene
+        same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
+        same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
+        judge = None if same and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
+        with replacing(task.output) as part:
+            save_as(kind, scene, part, name=task.output)
+            psnr = math.inf if judge is None else judge.psnr(read_back(scene, part, kind))[0]
+            done = task.result(
+                "done",
+                before=len(dense), after=len(scene),
+                megabytes_before=source_bytes / 1e6, megabytes=part.stat().st_size / 1e6,
+                psnr=psnr if math.isfinite(psnr) else None,
+                seconds=time.perf_counter() - start,
+                note="kept whole" if same else source.missing[2:-1],
+            )  # fmt: skip
+            for old in (task.output, pair_of(task.output)):  # must not stand beside the new record
+                old.unlink(missing_ok=True)
+            proofs = {"key": key, "options": self.options, "sha256": content_hash(part)}
+            write_json({**dataclasses.asdict(done), **proofs}, task.record)
+        return done
+
+    def _draw(self, task: _Task) -> None:
+        """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
+        before, after = read_scene(task.source), read_scene(task.output)
+        after = after if after.offset is None else after.at_offset(before.offset)
+        known = view_source(before, run=task.source, data=self.data).known(VIEW_COUNTS.opening)
+        with suppress(DataError):
+            draw_pair(before, after, known, pair_of(task.output))
 
 
-def _drawn(data: str | Path | None, scene: Path, result: Path, picture: Path) -> None:
-    """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
-    before, after = read_scene(scene), read_scene(result)
-    after = after if after.offset is None else after.at_offset(before.offset)
-    with suppress(DataError):
-        draw_pair(before, after, view_source(before, run=scene, data=data).known(VIEW_COUNTS.opening), picture)
+def _read_record(task: _Task) -> dict[str, Any] | None:
+    """The record of a result; None if it is missing or damaged."""
+    try:
+        record = json.loads(read_text(task.record))
+        texts = all(isinstance(record[name], str) for name in ("key", "sha256", "note"))
+        numbers = all(record[name] is None or 0 <= record[name] < 1e18 for name in FIGURES)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+        return None
+    return record if texts and numbers else None
 
 
-def _converted(
-    sh: str,
-    up: str | None,
-    scale: float,
-    original_frame: bool,
-    offset: Sequence[float] | Literal["centre"] | None,
-    dense: Gaussians,
-    path: Path,
-) -> SmallerScene:
-    """One scene of a folder for another format."""
-    cut = dense if sh == "all" else cut_sh(dense, int(sh))
-    return SmallerScene(place(cut, up, scale, path if original_frame else None, offset))
+def _known(task: _Task) -> SceneResult:
+    """The result in a record."""
+    record = _read_record(task)
+    if record is None:
+        return task.result("open")
+    return task.result("done before", **{name: record[name] for name in (*FIGURES, "note")})

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians, Offset
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import axis_along, smallest_turn
-from pointsplat_ns.io.offsets import from_centre, warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
@@ -27,13 +24,11 @@ def place(
     up: str | None = None,
     scale: float = 1.0,
     original_frame: str | Path | None = None,
-    offset: Sequence[float] | Literal["centre"] | None = None,
 ) -> Gaussians:
     """Turn and scale a scene, or move it back to the frame of the data that it was trained on.
 
     nerfstudio turns, centres and scales the poses of a dataset before training. ``original_frame`` undoes this, so
-    that the scene fits the poses, meshes and measurements of the data. It applies first, then ``up``, then ``scale``,
-    then ``offset``.
+    that the scene fits the poses, meshes and measurements of the data. It applies first, then ``up``, then ``scale``.
 
     Args:
         scene: N Gaussians.
@@ -42,15 +37,12 @@ def place(
             result declares the new one.
         scale: factor on positions and sizes, above 0.
         original_frame: the Splatfacto run of the scene (its folder, ``config.yml`` or checkpoint).
-        offset: (3,) the point that becomes the origin of positions, in the frame of the scene's file, scene units:
-            ``scene.offset`` of the result. "centre" is the median position, rounded. By default it stays. The scene
-            itself does not move in the frame of its file.
 
     Returns:
         N Gaussians on the same device.
 
     Raises:
-        PointSplatError: if ``up`` is not an axis, ``scale`` is not above 0, or ``offset`` is not three numbers.
+        PointSplatError: if ``up`` is not an axis, or ``scale`` is not above 0.
         DataError: if up has to be estimated, and no Gaussian is visible.
         SceneError: if ``original_frame`` is not a run, or lacks its ``dataparser_transforms.json``.
 
@@ -63,7 +55,6 @@ def place(
     """
     if not 0 < scale < math.inf:
         raise PointSplatError(f"scale is {scale:g}; expected a number above 0")
-    point = None if offset is None or offset == "centre" else _point(offset)
     directions = None if up is None else _directions(up)
     if original_frame is not None:
         scene = _frame_at(original_frame).inverse().apply(scene)
@@ -74,13 +65,7 @@ def place(
         scene = turned.replace(up=axis_along(wanted))
     if scale != 1.0:
         scene = Similarity(torch.eye(3, **DOUBLES), scale, torch.zeros(3, **DOUBLES)).apply(scene)
-    if offset == "centre":
-        return from_centre(scene)
-    if point is None:
-        return scene
-    moved = scene.at_offset(point)
-    warn_if_far(moved, "the scene about this offset")
-    return moved
+    return scene
 
 
 def _frame_at(path: str | Path) -> Similarity:
@@ -110,16 +95,6 @@ def run_frame(run: Run) -> Similarity:
         )
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
-
-
-def _point(offset: Sequence[float]) -> Offset:
-    try:
-        x, y, z = map(float, offset)
-    except (TypeError, ValueError):
-        x = y = z = math.nan
-    if not math.isfinite(x + y + z):
-        raise PointSplatError(f"offset is {offset!r}; expected three numbers, or 'centre'")
-    return x, y, z
 
 
 def _directions(up: str) -> tuple[Tensor | None, Tensor]:

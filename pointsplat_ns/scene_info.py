@@ -1,10 +1,9 @@
-"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds, suspicious rows, and sizes of files."""
+"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds and suspicious rows."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError, SceneError
+from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
-from pointsplat_ns.io.formats import FORMATS, Format
-from pointsplat_ns.io.formats.sog import sog_bytes_like
-from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.io.scene import kind_of, read_scene, source_parts
-from pointsplat_ns.io.usable import unusable_kept
 from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
@@ -43,7 +38,7 @@ class SceneInfo:
     file: str
     """The path of the scene; empty for Gaussians in memory, whose format is empty too, and whose size is 0."""
     format: str
-    """Name of the format; for a run or a checkpoint also the program or method, and the step."""
+    """Name of the format; for a run or a checkpoint in one its method and step."""
     bytes: int
     gaussians: int
     sh_degree: int
@@ -72,9 +67,6 @@ class SceneInfo:
     """Corners of the middle 96 % of positions along each axis."""
     suspicious: dict[str, int]
     """Number of rows by kind of defect; kinds without rows are left out."""
-    file_bytes: dict[str, dict[str, int]]
-    """Bytes of a file by format and share of the Gaussians that is kept. Sizes of ``.spz`` and ``.sog`` are estimated
-    from 10,000 Gaussians; there is no entry where the scene is too large for the format."""
 
     @property
     def up_text(self) -> str:
@@ -104,15 +96,14 @@ def info(
     Example:
         >>> import pointsplat_ns as ps
         >>> found = ps.info(ps.example_room())
-        >>> found.gaussians, found.sh_degree, found.up_text, found.file_bytes[".splat"]["10%"]
-        (62845, 1, 'z (a guess)', 201120)
+        >>> found.gaussians, found.sh_degree, found.up_text
+        (62845, 1, 'z (a guess)')
     """
     size, known = parse_resolution(resolution), up_named(up)
     file, kind, bytes_ = "", "", 0
     if not isinstance(scene, Gaussians):
         file = str(scene)
-        with unusable_kept():
-            scene = read_scene(scene)
+        scene = read_scene(scene, all_rows=True)
         parts = source_parts(file)
         kind = kind_of(file)
         bytes_ = sum(part.stat().st_size for part in parts)
@@ -144,7 +135,6 @@ def info(
         bounds=_corners(good.means, 0.0),
         content=_corners(good.means, 0.02),
         suspicious=_suspicious(scene, usable),
-        file_bytes={kind.suffix: sizes for kind in FORMATS if (sizes := _sizes(kind, good))},
     )
 
 
@@ -177,24 +167,3 @@ def _corners(means: Tensor, outside: float) -> list[list[float]]:
     ranked = means.sort(dim=0).values
     last = len(means) - 1
     return [ranked[round(outside * last)].tolist(), ranked[round((1 - outside) * last)].tolist()]
-
-
-def _sizes(kind: Format, scene: Gaussians) -> dict[str, int]:
-    """Bytes of a file by share of the Gaussians; empty for formats that are not written to one file."""
-    counts = {f"{share:.0%}": int(share * len(scene) + 0.5) for share in (1.0, 0.5, 0.3, 0.1, 0.03)}
-    if kind.bytes_of is not None:
-        return {text: kind.bytes_of(count, scene.sh_degree, scene.traits) for text, count in counts.items()}
-    if kind.suffix not in (".spz", ".sog") or not len(scene):
-        return {}
-    try:
-        size = _spz_bytes_like(scene) if kind.suffix == ".spz" else sog_bytes_like(scene)
-    except SceneError:  # positions that do not fit 24 bits
-        return {}
-    return {text: size(count) for text, count in counts.items()}
-
-
-def _spz_bytes_like(scene: Gaussians) -> Callable[[int], int]:
-    """Estimated bytes of an SPZ file by the number of Gaussians, from 10,000 of them."""
-    sample = scene[:: -(-len(scene) // 10_000)]
-    each = len(encode_spz(sample)) / len(sample)
-    return lambda count: round(each * count)

@@ -61,7 +61,6 @@ RUNS = {
     "tradeoff room.ply --keep 10% --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
     "convert room.ply room.spz": "600 Gaussians",
     "convert room.ply room.sog": "600 Gaussians",
-    "convert room.ply room.glb": "600 Gaussians",
     "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.2": "5 frames",
     "export run -o exported.ply": "300 Gaussians",
     "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",

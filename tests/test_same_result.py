@@ -16,7 +16,7 @@ import pointsplat_ns as ps
 from making import box_room, fast_config, run_of, same_bits
 from pointsplat_ns.pruning.methods import METHODS
 
-FORMATS = ("ply", "compressed.ply", "spz", "sog", "splat", "glb")
+FORMATS = ("ply", "spz", "sog", "splat")
 
 STEPS = 50
 """Of splatfacto-cpu: densification, opacity reset and SH degrees are in them."""

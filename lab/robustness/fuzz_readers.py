@@ -22,7 +22,8 @@ from PIL import Image
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.scene import read_scene, save
+from pointsplat_ns.io.formats.sog import encode_sog
+from pointsplat_ns.io.scene import read_scene
 
 Read = Callable[[bytes], object]
 """Reads the bytes of one file, or raises."""
@@ -81,16 +82,12 @@ def _in_folder(path: Path) -> Gaussians:
 
 
 def _sog_folder(folder: Path) -> None:
-    save(some_scene(), folder / "meta.json")
+    with zipfile.ZipFile(io.BytesIO(encode_sog(some_scene()))) as archive:
+        archive.extractall(folder)
 
 
 def _gzipped(data: bytes) -> bytes:
     return gzip.compress(data, 1, mtime=0)
-
-
-def _ksplat(data: bytes) -> bytes:
-    """The first 64 bytes of each of two headers, which zeros fill up, and the rows."""
-    return data[:64].ljust(4096, b"\0") + data[64:128].ljust(1024, b"\0") + data[128:]
 
 
 READERS |= {
@@ -102,10 +99,7 @@ READERS |= {
     "sog": at("a.sog", _scene),  # as they are: zip archives
     "sog-meta": at("meta.json", _in_folder, _sog_folder),
     "sog-image": at("quats.webp", _in_folder, _sog_folder),
-    "ksplat": at("a.ksplat", _scene, inside=_ksplat),
-    "glb": at("a.glb", _scene),  # also with SPZ inside
     "zip": at("a.zip", _scene),  # as they are
-    "zipped-ply": at("a.zip", _scene, inside=lambda data: _zip_of({"a.ply": data})),
     "checkpoint": at("a.ckpt", _scene),  # as they are: zip archives, or the pickles of earlier versions of torch
 }
 
@@ -130,12 +124,6 @@ def gsplat_bytes(scene: Gaussians) -> bytes:
     return _saved({"step": 1, "splats": values})
 
 
-def inria_bytes(scene: Gaussians) -> bytes:
-    """A checkpoint of INRIA's 3D Gaussian Splatting, without the optimiser's numbers."""
-    values = (scene.means, scene.features_dc[:, None], scene.features_rest, scene.scales, scene.quats, scene.opacities)
-    return _saved(((scene.sh_degree, *values, *[torch.zeros(len(scene))] * 3, {"state": {}}, 3.0), 1))
-
-
 def _zip_of(parts: dict[str, bytes]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
@@ -155,7 +143,6 @@ def _pickle_in(checkpoint: bytes) -> Make:
 READERS |= {
     "checkpoint-pickle": _pickle_in(_checkpoint_bytes(some_scene())),
     "gsplat-pickle": _pickle_in(gsplat_bytes(some_scene())),
-    "inria-pickle": _pickle_in(inria_bytes(some_scene())),
 }
 
 

@@ -30,7 +30,7 @@ from pointsplat_ns.cli.scene_options import Share
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.outputs import need_folder
 from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.looking.closeness import DenseReference
@@ -150,17 +150,17 @@ def measure_tables(
     if len(paths) < len(scenes):
         raise PointSplatError(f"two scenes have one name; expected different ones, found {', '.join(map(str, scenes))}")
     tools = Tools(options, Refiners(refiners), splat_transform)
-    with claimed_folder(output):
-        tables = Tables.read(output, force)
-        for name, path in paths.items():
-            tables.enter(name, _about(path, data, options), _groups(groups, paths).get(name))
-        tables.missing = {}
-        wanted = _wanted(tables, paths, keeps, tools, only)
-        try:
-            for name, cells in tracked(wanted.items(), "measuring", len(wanted)):
-                _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
-        finally:
-            write_tables(tables, output, keeps)
+    need_folder(output)
+    tables = Tables.read(output, force)
+    for name, path in paths.items():
+        tables.enter(name, _about(path, data, options), _groups(groups, paths).get(name))
+    tables.missing = {}
+    wanted = _wanted(tables, paths, keeps, tools, only)
+    try:
+        for name, cells in tracked(wanted.items(), "measuring", len(wanted)):
+            _measure(tables, output, name, open_scene(paths[name], data, options), cells, tools)
+    finally:
+        write_tables(tables, output, keeps)
     print(f"{output}: tables.md, tables.json and figure4.png")
     return tables
 

@@ -216,13 +216,13 @@ def _run(args: list[str]) -> None:
         from pointsplat_ns import __version__
         from pointsplat_ns.cli.help import after_help
         from pointsplat_ns.cli.printing import only_json
-        from pointsplat_ns.cli.scene_options import claims_until_the_end, quantities
+        from pointsplat_ns.cli.scene_options import quantities
         from pointsplat_ns.system.memory import keep_freed_memory
 
         keep_freed_memory()
         _ignore_matplotlibrc()
         level = logging.DEBUG if "--verbose" in args else logging.INFO
-        with _log_printed(level), _ended_by_signals(), only_json(args), claims_until_the_end(), quantities():
+        with _log_printed(level), _ended_by_signals(), only_json(args), quantities():
             if args == ["--version"]:
                 print(f"pointsplat-ns {__version__}")
             elif args and args[0] in COMMANDS:

@@ -24,7 +24,7 @@ def clean(
     """Remove floaters, and what cannot be drawn or is seen from nowhere.
 
     Args:
-        output: file to write: .ply, .spz, .sog, .splat, .glb; by default in the format of the scene and
+        output: file to write: .ply, .spz, .sog, .splat; by default in the format of the scene and
             beside it: room_clean.ply for room.ply.
         strength: in [0, 1]; more removes more floaters: Gaussians far before what views show, without which pictures
             hardly change. 0 removes only what cannot be drawn or seen.
@@ -41,13 +41,12 @@ def clean(
     options.need_one_scene(scene)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "clean")
-    options.claim_outputs(output, force, picture)
-    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).budget_suffix
+    options.check_outputs(output, force, picture)
+    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).suffix
     with fixed_threads(threads):
         dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
         ps.save(cleaned, output, progress=True, overwrite=True)
-        with options.scene_written(output):
-            quality = quality_of_file(dense, source, cleaned, output, suffix)
+        quality = quality_of_file(dense, source, cleaned, output, suffix)
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})

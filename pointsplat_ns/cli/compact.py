@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.goals import GOALS, GoalName, file_for, print_next, print_use
 from pointsplat_ns.cli.printing import (
     end_if_interrupted,
-    print_details,
     print_if_larger,
     print_json,
     print_result,
@@ -24,6 +22,7 @@ from pointsplat_ns.cli.printing import (
 if TYPE_CHECKING:
     from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.quality import Quality
+    from pointsplat_ns.folders import SceneResult
     from pointsplat_ns.gaussians import Gaussians
 
 
@@ -62,7 +61,7 @@ def compact(
 
     A folder with config.yml is a run: one scene. Any other folder is a folder of scenes: all files with Gaussians below
     it, and the newest Splatfacto run of each experiment. Finished scenes are skipped, so the same command continues
-    after an interruption. It may also run several times at once, or on several machines that share the folder.
+    after an interruption.
 
     Args:
         output: the file to write, of any format as for prune; by default in the format of the scene and beside
@@ -102,16 +101,21 @@ def compact(
     unasked = goal is None and keep is None and refiner is None and target_db is None
     keep = chosen.keep if keep is None and target_db is None else keep
     if is_folder_of_scenes(scene):
-        from pointsplat_ns.scene_folder import output_folder
+        from pointsplat_ns.folders import output_folder
 
-        one = {"--poses": poses, "--up": up, "--photos": photos, "--dry-run": dry_run}
-        return folder_command(
-            ps.compact_folder, scene, output or output_folder(scene, "compact"), one, json_output, jobs, threads,
-            keep=keep, refiner=refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-            target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
-            picture=picture, force=force,
-        )  # fmt: skip
-    options.need_no_jobs(scene, jobs)
+        for name, given in {"--poses": poses, "--up": up, "--photos": photos, "--dry-run": dry_run}.items():
+            if given is not None and given is not False:
+                raise ps.SceneError(f"{name} is for one scene; {scene} is a folder of scenes")
+        folder = output or output_folder(scene)
+        with fixed_threads(threads):
+            results = ps.compact_folder(
+                scene, folder, keep, refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
+                target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
+                picture=picture, jobs=1 if jobs is None else jobs, force=force, progress=True,
+            )  # fmt: skip
+        return _print_folder(results, folder, [path for path in (html, picture) if path is not None], json_output)
+    if jobs is not None:
+        raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
     from pointsplat_ns.compacting import Looking, compact_source
     from pointsplat_ns.compression.quality import quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
@@ -124,32 +128,23 @@ def compact(
     written = None if dry_run else output
     alone = chosen.page and html is None and not dry_run
     html = output.with_suffix(".html") if alone else html
-    options.claim_outputs(written, force, picture, html)
+    options.check_outputs(written, force, picture, html)
     kind = format_to_write(output)
     request = CompactRequest.of(
-        refiner_at(refiner),
-        keep,
-        by,
-        sh,
-        clean,
-        RepairBudget(effort, seconds),
-        bool(photos),
-        kind.budget_suffix,
-        target_db,
+        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.suffix, target_db
     )
     looking = Looking(poses, resolution, up, data, photos)
     with fixed_threads(threads):
         dense, result, source = compact_source(scene, request, looking, progress=True)
     if not dry_run:
         ps.save(result.scene, output, progress=True, overwrite=True)
-    with options.scene_written(written):
-        quality = quality_of_file(dense, source, result.scene, written, kind.budget_suffix)
-        if quality is not None:
-            quality = replace(quality, photos=result.photo_gain)
-        files = [_file_text(scene), "not written" if written is None else _file_text(written)]
-        shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
-        if html is not None:
-            _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
+    quality = quality_of_file(dense, source, result.scene, written, kind.suffix)
+    if quality is not None:
+        quality = replace(quality, photos=result.photo_gain)
+    files = [_file_text(scene), "not written" if written is None else _file_text(written)]
+    shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
+    if html is not None:
+        _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
     if json_output:
         made = {
             "refined": result.accepted,
@@ -164,14 +159,40 @@ def compact(
     also += ["trained on photos"] * (result.last.photos is not None)
     print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
     print_if_larger(scene, written)
-    if verbose:
-        print_details(quality, dense, result.scene)
+    if verbose and quality is not None:
+        print(quality.details)
     if shown is not None:
         print(shown)
     print_use(goal, html, name_of(scene), quality)
     end_if_interrupted(result.interrupted)
     if unasked and written is not None:
         print_next(scene, written, quality)
+
+
+def _print_folder(results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool) -> None:
+    """Print a table of the scenes of a folder, or JSON. Raises PointSplatError if one has failed."""
+    from pointsplat_ns.errors import PointSplatError
+    from pointsplat_ns.io.discovery import FOLDER_FILES
+    from pointsplat_ns.system.terminal import print_table
+
+    failed = sum(result.status == "failed" for result in results)
+    if json_output:
+        print_json({"output": folder, "scenes": [asdict(result) for result in results]})
+    else:
+        forms = (",", ",", ".2f", ".1f", ".1f")
+        rows = []
+        for result in results:
+            numbers = (result.before, result.after, result.megabytes, result.psnr, result.seconds)
+            cells = ("-" if value is None else f"{value:{form}}" for value, form in zip(numbers, forms, strict=True))
+            said = result.error or result.note
+            rows.append((result.name, *cells, f"{result.status}: {said}" if said else result.status))
+        header = ("scene", "before", "after", "MB", "dB", "seconds", "status")
+        print_table(header, rows, "dB: PSNR against the scene's own renders", left=(0, 6))
+        print(f"{folder}: {len(results) - failed} of {len(results)} scenes, and the table {FOLDER_FILES.scenes_table}")
+        for path in shown:
+            print(f"{path}: all scenes before and after")
+    if failed:
+        raise PointSplatError(f"{failed} of {len(results)} scenes failed; the same command tries them again")
 
 
 def _file_text(path: Path) -> str:

@@ -32,7 +32,7 @@ def export(
     options.need_scenes(run)
     import pointsplat_ns as ps
 
-    options.claim_outputs(output, force)
+    options.check_outputs(output, force)
     start = time.perf_counter()
     exported = ps.load(run, scene, data)
     ps.save(exported, output, progress=True, overwrite=True)

@@ -3,18 +3,9 @@
 from __future__ import annotations
 
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
-    "prune": (
-        ("a tenth of the Gaussians, to room_pruned.ply", "pointsplat prune room.ply --keep 10%"),
-        ("a small file for the web", "pointsplat prune room.ply --keep 20% --sh auto -o small.spz"),
-        (
-            "see first what would be kept",
-            "pointsplat prune room.ply --keep 30% --by paper --dry-run --plot kept.png",
-        ),
-    ),
+    "prune": (("a tenth of the Gaussians, to room_pruned.ply", "pointsplat prune room.ply --keep 10%"),),
     "compact": (
         ("a tenth, repaired, and a page to compare", "pointsplat compact room.ply --keep 10% --html small.html"),
-        ("for a page of the web", "pointsplat compact room.ply --for web"),
-        ("the smallest file of at least 32 dB", "pointsplat compact room.ply --target-db 32 -o small.sog"),
         ("with the photos and their COLMAP model", "pointsplat compact room.ply --photos images --poses sparse/0"),
         ("every scene of a folder, and a gallery", "pointsplat compact rooms --keep 10% --jobs 4 --html all.html"),
     ),
@@ -26,20 +17,14 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("three levels of detail", "pointsplat lod room.ply --levels 50% 10% 2%"),
         ("a stream for viewers on the web", "pointsplat lod room.ply --stream -o page"),
     ),
-    "tradeoff": (
-        ("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),
-        ("two methods of pruning", "pointsplat tradeoff room.ply --by merge paper --repairs none -o methods"),
-    ),
+    "tradeoff": (("measure the trade, to room_tradeoff", "pointsplat tradeoff room.ply"),),
     "convert": (
         ("an SPZ of fewer SH bands", "pointsplat convert room.ply room.spz --sh 1"),
-        ("a run, in the frame of its photos' poses", "pointsplat convert outputs/room room.ply --original-frame"),
-        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.glb --up=-y:z"),
+        ("what is up, -y, turned to z", "pointsplat convert room.ply turned.spz --up=-y:z"),
     ),
     "info": (
         ("what is in a scene", "pointsplat info room.ply"),
-        ("scenes side by side", "pointsplat info room.ply small.spz"),
         ("where other commands look at it from", "pointsplat info room.ply --views sheet.png"),
-        ("the same for a program", "pointsplat info room.spz --json"),
     ),
     "view": (
         ("a scene in the browser", "pointsplat view room.ply"),
@@ -48,16 +33,9 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "render": (
         ("a film", "pointsplat render room.ply -o room.mp4"),
         ("two scenes with a wipe", "pointsplat render room.ply room_pruned.ply --split wipe -o both.mp4"),
-        ("one picture", "pointsplat render room.ply -o room.png --width 1280 --height 720"),
     ),
-    "export": (
-        ("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),
-        ("one scene of a trained refiner", "pointsplat export outputs/refiner --scene room2 -o room2.ply"),
-    ),
-    "demo": (
-        ("a scene to try commands with: room.ply", "pointsplat demo"),
-        ("in another format", "pointsplat demo -o room.spz"),
-    ),
+    "export": (("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),),
+    "demo": (("a scene to try commands with: room.ply", "pointsplat demo"),),
 }
 """Command lines of every command, with the purpose of each."""
 

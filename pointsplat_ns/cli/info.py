@@ -25,8 +25,8 @@ def info(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, rows that look wrong, and what
-    files of other formats would weigh. Several, and all scenes of a folder, make a table.
+    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and rows that look wrong.
+    Several, and all scenes of a folder, make a table.
 
     Args:
         scenes: files of any format, checkpoints, runs (their folder or config.yml), or folders of scenes.
@@ -39,7 +39,7 @@ def info(
 
     if not any(map(os.path.exists, scenes)):
         options.need_scenes(*scenes)
-    options.claim_outputs(None, force, views)
+    options.check_outputs(None, force, views)
     scenes = tuple(path for scene in scenes for path in _scenes_of(scene))
     if not scenes or (views is not None and len(scenes) > 1):
         raise PointSplatError(f"{len(scenes)} scenes; expected {'one' if views else 'at least one'}")
@@ -72,7 +72,7 @@ def _scenes_of(path: Path) -> list[Path]:
     from pointsplat_ns.io.discovery import find_scenes
     from pointsplat_ns.io.scene import is_folder_of_scenes
 
-    return [scene.path for scene in find_scenes(path)] if is_folder_of_scenes(path) else [path]
+    return [*find_scenes(path).values()] if is_folder_of_scenes(path) else [path]
 
 
 def _print_table(found: list[SceneInfo]) -> None:
@@ -80,22 +80,18 @@ def _print_table(found: list[SceneInfo]) -> None:
     from pointsplat_ns.io.files import three_digits
     from pointsplat_ns.system.terminal import print_table
 
-    suffixes = [".ply", ".compressed.ply", ".spz", ".sog"]
     rows = []
     for one in found:
-        sizes = [one.file_bytes.get(suffix, {}).get("100%") for suffix in suffixes]
         rows.append([
             one.file, one.format, three_digits(one.bytes / 1e6), f"{one.gaussians:,}", f"{one.sh_degree}", one.up_text,
             "-" if one.fill is None else f"{one.fill:.1f}", f"{sum(one.suspicious.values()):,}",
-            *("-" if size is None else three_digits(size / 1e6) for size in sizes),
         ])  # fmt: skip
-    header = ["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious", *suffixes]
-    caption = "fill: Gaussians drawn per pixel; the last four: MB in this format, .spz and .sog estimated"
-    print_table(header, rows, caption, left=(0, 1, 5))
+    header = ["file", "format", "MB", "Gaussians", "SH", "up", "fill", "suspicious"]
+    print_table(header, rows, "fill: Gaussians drawn per pixel", left=(0, 1, 5))
 
 
 def _print(found: SceneInfo) -> None:
-    from pointsplat_ns.io.files import bytes_text, three_digits
+    from pointsplat_ns.io.files import bytes_text
 
     print(f"{found.file}: {found.format}, {bytes_text(found.bytes)}")
     print(f"{found.gaussians:,} Gaussians of SH degree {found.sh_degree}{', antialiased' if found.antialiased else ''}")
@@ -115,11 +111,6 @@ def _print(found: SceneInfo) -> None:
     _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
     _bars("largest standard deviation, scene units, from", found.sizes)
     print("suspicious: " + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing"))
-    print("files, MB, if a share of the Gaussians is kept (.spz and .sog are estimated):")
-    shares = next(iter(found.file_bytes.values()), {})
-    print(" " * 18 + "".join(f"{share:>9}" for share in shares))
-    for suffix, sizes in found.file_bytes.items():
-        print(f"  {suffix:<16}" + "".join(f"{three_digits(size / 1e6):>9}" for size in sizes.values()))
 
 
 def _bars(title: str, counts: dict[str, int]) -> None:

@@ -10,7 +10,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from pointsplat_ns.cli.scene_options import file_bytes
 from pointsplat_ns.system.quantities import seconds_text
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float,
         **({} if before is None else {"gaussians_before": before}),
         "gaussians": len(scene),
         "sh_degree": scene.sh_degree,
-        "bytes": ply_bytes(len(scene), scene.sh_degree) if where is None else file_bytes(where),
+        "bytes": ply_bytes(len(scene), scene.sh_degree) if where is None else where.stat().st_size,
         "seconds": seconds,
     }
 
@@ -92,7 +91,7 @@ def print_result(
 
 def print_if_larger(scene: Path, where: Path | None) -> None:
     """Print a note if a result takes more bytes than the scene's file, whose format has fewer for each Gaussian."""
-    if where is not None and scene.is_file() and scene.suffix != ".yml" and file_bytes(scene) < file_bytes(where):
+    if where is not None and scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
         remedy = "" if scene.suffix == where.suffix else f"; a name that ends in {scene.suffix} makes it smaller"
         print(f"note: {where} is larger than {scene}: {written_size(where)}, not {written_size(scene)}{remedy}")
 
@@ -108,25 +107,4 @@ def written_size(where: Path) -> str:
     """Size of a scene's file, in words."""
     from pointsplat_ns.io.files import bytes_text
 
-    return bytes_text(file_bytes(where))
-
-
-def print_details(quality: Quality | None, before: Gaussians, after: Gaussians) -> None:
-    """Print the details of a quality, and a table of counts and quantiles, before and after."""
-    from pointsplat_ns.compression.pictures import opacity_quantiles, size_quantiles
-    from pointsplat_ns.system.terminal import print_table
-
-    if quality is not None:
-        print(quality.details)
-    rows = {
-        "Gaussians": lambda s: f"{len(s):,}",
-        "SH degree": lambda s: f"{s.sh_degree}",
-        "opacity": lambda s: " / ".join(f"{value:.2f}" for value in opacity_quantiles(s)),
-        "size, scene units": lambda s: " / ".join(f"{value:.2g}" for value in size_quantiles(s)),
-    }
-    print_table(
-        ("", "before", "after"),
-        [(name, text(before), text(after)) for name, text in rows.items()],
-        "quantiles are 10 / 50 / 90 %; size is the largest standard deviation",
-        left=(0, 1, 2),
-    )
+    return bytes_text(where.stat().st_size)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.folders import folder_command
 from pointsplat_ns.cli.printing import (
-    print_details,
     print_if_larger,
     print_json,
     print_result,
@@ -16,7 +14,7 @@ from pointsplat_ns.cli.printing import (
 
 
 def prune(
-    scene: options.Scenes,
+    scene: options.Scene,
     output: options.Output = None,
     keep: str = "0.3",
     by: str = "merge",
@@ -37,17 +35,14 @@ def prune(
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
-    """Make a scene smaller, or all scenes of a folder: merge neighbours, or keep the most important Gaussians. No
-    photos are needed.
+    """Make a scene smaller: merge neighbours, or keep the most important Gaussians. No photos are needed.
 
     If anything has to be rendered, cameras are those of --poses, else those of the run's dataset; if there are none,
     they are sampled.
 
     Args:
-        output: the file to write; its name says the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. By
-            default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in a run's folder. For
-            a folder of scenes, another folder; by default rooms_pruned beside rooms. Each result there has the format
-            of its scene.
+        output: the file to write; its name says the format: .ply, .spz, .sog or .splat. By
+            default in the scene's format and beside it: room_pruned.ply for room.ply, pruned.ply in a run's folder.
         keep: size of the result: a ratio (0.3), a percentage (30%), a count (50000 or 50k), the size of the file (12MB
             or 800kB; for .spz and .sog the count is searched for, which takes two or three times as long), or auto:35,
             the smallest scene whose renders reach 35 dB PSNR against those of the dense scene (auto alone means 35).
@@ -63,8 +58,8 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
-            parts, with files beside the output; a command that was killed resumes. With --jobs each process may take
-            so much.
+            parts, with files beside the output; a command that was killed resumes. With --jobs each process may
+            take so much.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -74,34 +69,17 @@ def prune(
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.ply import PlyRows
-    from pointsplat_ns.io.scene import is_folder_of_scenes
     from pointsplat_ns.looking.sizes import parse_resolution
     from pointsplat_ns.looking.upright import up_named
     from pointsplat_ns.system.progress import progress_bar
     from pointsplat_ns.system.threads import fixed_threads
 
-    if is_folder_of_scenes(scene):
-        from pointsplat_ns.folders import prune_folder
-        from pointsplat_ns.scene_folder import output_folder
-
-        one = {
-            "--poses": poses,
-            "--up": up,
-            "--plot": plot,
-            "--dry-run": dry_run,
-            "--memory": memory,
-            "--photos": photos,
-        }
-        return folder_command(
-            prune_folder, scene, output or output_folder(scene, "pruned"), one, json_output, jobs, threads,
-            request=PruneRequest(keep, by, sh, opacity_weight, clean), resolution=resolution, data=data,
-            force=force,
-        )  # fmt: skip
+    options.need_one_scene(scene)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "pruned")
     written = None if dry_run else output
-    options.claim_outputs(written, force, plot)
-    suffix = format_to_write(output).budget_suffix
+    options.check_outputs(written, force, plot)
+    suffix = format_to_write(output).suffix
     request = PruneRequest(keep, by, sh, opacity_weight, clean, suffix)
     limit = None if memory is None else 1e6 * memory
     rows = rows_to_prune(scene, request, limit)
@@ -109,16 +87,16 @@ def prune(
     small: ps.Gaussians | PlyRows | None
     with fixed_threads(threads):
         if rows is None:
-            options.need_no_jobs(scene, jobs)
+            if jobs is not None:
+                raise ps.SceneError(f"{scene}: fits into memory; --jobs is for a scene that is merged in parts")
             looking = Looking(poses, resolution, up, data, photos)
             dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
             small, before = pruned, len(dense)
             if not dry_run:
                 ps.save(pruned, output, progress=True, overwrite=True)
-            with options.scene_written(written):
-                quality = quality_of_file(dense, source, pruned, written, suffix)
-                if plot is not None:
-                    ps.plot_distributions({"before": dense, "after": pruned}, plot)
+            quality = quality_of_file(dense, source, pruned, written, suffix)
+            if plot is not None:
+                ps.plot_distributions({"before": dense, "after": pruned}, plot)
         elif dry_run or plot is not None or photos is not False:
             raise ps.SceneError(f"{scene}: does not fit into memory; expected no --dry-run, --plot or --photos")
         else:
@@ -136,7 +114,7 @@ def prune(
     unknown = "not compared with the dense scene: it does not fit into memory"
     print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
     print_if_larger(scene, written)
-    if verbose and dense is not None and isinstance(small, ps.Gaussians):
-        print_details(quality, dense, small)
+    if verbose and quality is not None:
+        print(quality.details)
     if plot is not None:
         print(f"{plot}: opacity and volume, before and after")

@@ -47,15 +47,16 @@ def render(
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
     from pointsplat_ns.io.files import bytes_text
+    from pointsplat_ns.io.outputs import need_folder, need_writable
     from pointsplat_ns.pages.video import kind_of
 
     start = time.perf_counter()
     options.check_poses(poses)
     output = output or _beside(scene)
     if kind_of(output) == "frames":
-        options.claim_folder(output)
+        need_folder(output)
     else:
-        options.claim_file(output, force)
+        need_writable(output, force)
     count = ps.render_path(
         scene, output, other, path=path, views=poses, split=split, up=up, data=data, width=width, height=height,
         fps=fps, seconds=seconds, force=force, progress=True,

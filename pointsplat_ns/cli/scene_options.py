@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -54,8 +52,8 @@ Force = Annotated[bool, tyro.conf.arg(help="overwrite existing files.")]
 Jobs = Annotated[
     int | None,
     tyro.conf.arg(
-        help="for a folder, or for a scene that prune merges in parts: number of processes that share scenes or parts, "
-        "and the cores; by default 1."
+        help="for a folder, or for a scene that prune merges in parts: number of processes that share the work and the "
+        "cores; by default 1."
     ),
 ]
 Threads = Annotated[
@@ -67,7 +65,7 @@ Threads = Annotated[
 ]
 Verbose = Annotated[
     bool,
-    tyro.conf.arg(help="print more: what was chosen for the scene, and the distributions of opacities and sizes."),
+    tyro.conf.arg(help="print more: what was chosen for the scene."),
 ]
 Json = Annotated[
     bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")
@@ -107,14 +105,6 @@ def need_scenes(*paths: Path | None) -> None:
         raise SceneError(f"{', '.join(gone)}: {what}; expected a scene: {ONE_SCENE}")
 
 
-def need_no_jobs(scene: Path, jobs: int | None) -> None:
-    """Raise a SceneError if a number of processes is given, which is for a folder of scenes."""
-    from pointsplat_ns.errors import SceneError
-
-    if jobs is not None:
-        raise SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
-
-
 def need_one_scene(path: Path) -> None:
     """Raise a SceneError if the path is a folder of scenes."""
     from pointsplat_ns.errors import SceneError
@@ -122,69 +112,25 @@ def need_one_scene(path: Path) -> None:
 
     if is_folder_of_scenes(path):
         raise SceneError(
-            f"{path}: a folder without config.yml, so no run; expected {SCENE_KINDS}; compact, prune, "
-            "convert and info take a folder of scenes"
+            f"{path}: a folder without config.yml, so no run; expected {SCENE_KINDS}; compact and "
+            "info take a folder of scenes"
         )
 
 
-_CLAIMS: ContextVar[ExitStack] = ContextVar("claims")
-
-
-@contextmanager
-def claims_until_the_end() -> Iterator[None]:
-    """Release all claims on outputs when the context ends: that of one command."""
-    with ExitStack() as claims:
-        token = _CLAIMS.set(claims)
-        try:
-            yield
-        finally:
-            _CLAIMS.reset(token)
-
-
-def claim_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
-    """Check and hold the files that a command is going to write (a scene of any writable format, a picture, a page),
-    before its long computations and until it ends. Raises SceneError if a path has another suffix, or as
-    :func:`~pointsplat_ns.io.outputs.claimed`."""
+def check_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
+    """Check the files that a command is going to write (a scene of any writable format, a picture, a page) before its
+    long computations. Raises SceneError if a path has another suffix, or as
+    :func:`~pointsplat_ns.io.outputs.need_writable`."""
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.outputs import need_suffix
+    from pointsplat_ns.io.outputs import need_suffix, need_writable
 
-    files = []
     if scene is not None:
         format_to_write(scene)
-        files += [scene.with_name(name) for name in _file_names(scene)]
     for path, kind in ((png, ".png"), (html, ".html")):
         if path is not None:
             need_suffix(path, kind)
-            files.append(path)
-    for file in files:
-        claim_file(file, force)
-
-
-def claim_file(path: Path, force: bool) -> None:
-    """Check and hold one file until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed`."""
-    from pointsplat_ns.io.outputs import claimed
-
-    _CLAIMS.get().enter_context(claimed(path, force))
-
-
-def claim_folder(folder: Path) -> None:
-    """Check and hold a folder until the command ends, see :func:`~pointsplat_ns.io.outputs.claimed_folder`."""
-    from pointsplat_ns.io.outputs import claimed_folder
-
-    _CLAIMS.get().enter_context(claimed_folder(folder))
-
-
-@contextmanager
-def scene_written(output: Path | None) -> Iterator[None]:
-    """Let errors say that the scene has been written before, to ``output`` if that is not None."""
-    from pointsplat_ns.errors import PointSplatError
-
-    try:
-        yield
-    except PointSplatError as error:
-        if output is None:
-            raise
-        raise type(error)(f"{error}; the scene was written before, to {output}") from error
+    for path in filter(None, (scene, png, html)):
+        need_writable(path, force)
 
 
 def check_poses(poses: Path | None) -> None:
@@ -199,18 +145,6 @@ def check_poses(poses: Path | None) -> None:
         raise SceneError(
             f"{poses}: a run or a scene; expected {CAMERA_KINDS}; the poses of a run's own dataset need no --poses"
         )
-
-
-def file_bytes(path: Path) -> int:
-    """Size of a scene's file in bytes; for the meta.json of a SOG folder, of all parts together."""
-    return sum(part.stat().st_size for part in map(path.with_name, _file_names(path)) if part.exists())
-
-
-def _file_names(path: Path) -> tuple[str, ...]:
-    """Names of a scene's files: one, or for the meta.json of a SOG folder, all parts."""
-    from pointsplat_ns.io.formats import SOG_META, SOG_PARTS
-
-    return (path.name, *SOG_PARTS) if path.name == SOG_META else (path.name,)
 
 
 def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec:

@@ -204,7 +204,7 @@ def clean_scene(
         found = counted(len(clusters(dense[dropped.floating.to(dense.device)]).unique()), "cluster")
         rules.append((dropped.floating, dropped.indices, f"that float before what {len(floating)} views show, {found}"))
     notes = []
-    for gone, so_far, what in rules:
+    for gone, so_far, what in rules if len(dropped.undrawable) else rules[1:]:
         close = "" if reference is None or len(gone) == 0 else _closeness(reference, _without(dense, so_far))
         notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}{close}")
     return Cleaning(junk, len(dense), tuple(notes))

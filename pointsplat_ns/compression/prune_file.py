@@ -126,7 +126,7 @@ def prune_file(
     """
     start = time.perf_counter()
     check_jobs(jobs)
-    if output.suffix.lower() != ".ply" or output.name.lower().endswith(".compressed.ply"):
+    if output.suffix.lower() != ".ply":
         raise SceneError(
             f"{output}: is written as a whole; expected a .ply for a scene larger than memory, which "
             "`pointsplat convert` changes"

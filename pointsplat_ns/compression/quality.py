@@ -222,7 +222,7 @@ def judge_of(dense: Gaussians, source: ViewSource) -> Judge | None:
 def read_back(scene: Gaussians, path: Path, kind: Format) -> Gaussians:
     """The scene in a file of a format, which ``scene`` was written to; ``scene`` itself where nothing is lost, or
     nothing reads the format."""
-    return scene if kind.suffix == ".ply" or kind.read is None else kind.read(path).to(scene.device)
+    return scene if kind.suffix == ".ply" or kind.read is None else usable_part(kind.read(path)).to(scene.device)
 
 
 def through_file(scene: Gaussians, suffix: str) -> tuple[int, Gaussians]:

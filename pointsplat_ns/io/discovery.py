@@ -30,7 +30,6 @@ class FolderFiles:
     scenes: str = "pointsplat-scenes.json"
     """Command and options that all results in a folder of scenes have in common."""
     scenes_table: str = "scenes.csv"
-    scenes_lock: str = ".scenes.lock"
     levels: str = "lod.json"
     """Manifest of levels of detail."""
 
@@ -42,20 +41,10 @@ RESULT_ENDS = ("_pruned", "_compact", "_web", "_phone", "_headset", "_email")
 """Ends of the names that commands give their results beside a scene."""
 
 
-@dataclass(frozen=True)
-class FoundScene:
-    """A scene below a folder."""
-
-    name: str
-    """Where it lies below the folder, with ``/`` between folders; distinct. It has no suffix: ``room``, or ``room_ply``
-    beside ``room_spz``."""
-    path: Path
-    """What :func:`~pointsplat_ns.io.read_scene` takes."""
-
-
-def find_scenes(folder: Path | str) -> list[FoundScene]:
-    """Every scene below a folder, sorted by name: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder. Results of earlier commands are passed over: files of
+def find_scenes(folder: Path | str) -> dict[str, Path]:
+    """Every scene below a folder by its name, sorted: files that hold Gaussians, and the newest trained run of each
+    experiment, which has the name of the experiment's folder. A name is the path below the folder without a
+    suffix: ``deep/room``, or ``room_ply`` beside ``room_spz``. Results of earlier commands are passed over: files of
     the names that these give by default, and whole folders of results. Raises SceneError if there is no such folder, it
     is a run, or there is no scene below it."""
     folder = Path(folder)
@@ -70,14 +59,13 @@ def find_scenes(folder: Path | str) -> list[FoundScene]:
             files.remove(path)
     named = [(_stem(path.relative_to(folder)), path) for path in files]
     with suppress(SceneError):  # no run; those passed over have been named
-        named += [(_name_below(folder, run), run.folder) for run in find_runs(folder, need_data=False)]
+        named += [(_name_below(folder, run), run.folder) for run in find_runs(folder)]
     if not named:
         raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
     shared = {name for name, count in Counter(name for name, _ in named).items() if count > 1}
     named = [(name + _format_end(path) if name in shared else name, path) for name, path in named]
     named.sort(key=lambda pair: (pair[0], str(pair[1])))
-    names = distinct(name for name, _ in named)
-    return [FoundScene(name, path) for name, (_, path) in zip(names, named, strict=True)]
+    return dict(zip(distinct(name for name, _ in named), (path for _, path in named), strict=True))
 
 
 def find_runs_and_plys(
@@ -94,7 +82,7 @@ def find_runs_and_plys(
     why_no_run: SceneError | None = None
     try:
         if folder.suffix.lower() != ".ply":
-            runs = find_runs(folder, need_data=False)
+            runs = find_runs(folder)
     except SceneError as error:
         why_no_run = error
     named = dict(zip(distinct(map(scene_name, runs)), runs, strict=True))
@@ -102,23 +90,15 @@ def find_runs_and_plys(
     return named, {f"{name}.ply" if name in named else name: path for name, path in plys}, why_no_run
 
 
-def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
-    """The newest run of each experiment below ``folder``, sorted by the experiment's name. Runs of other methods and
-    runs without a complete checkpoint are skipped.
-
-    Args:
-        folder: a run, or any folder above several.
-        need_data: as for :func:`open_run`.
-
-    Raises:
-        SceneError: if there is no such run, if ``folder`` is itself a run of another method, or if the data of a run is
-            needed and not found.
-    """
+def find_runs(folder: Path | str) -> list[Run]:
+    """The newest run of each experiment at or below ``folder``, sorted by the experiment's name. Runs of other methods
+    and runs without a complete checkpoint are skipped. The data of runs is not looked for. Raises SceneError if there
+    is no such run, or ``folder`` is itself a run of another method."""
     folder = Path(folder)
     if not folder.exists():
         raise SceneError(f"{folder}: no such folder; expected one with trained nerfstudio runs in it")
     if not folder.is_dir() or (folder / RUN_FILES.config).is_file():
-        run = open_run(folder, need_data)
+        run = open_run(folder, need_data=False)
         if not run.is_gaussian_scene:
             raise SceneError(
                 f"{run.folder}: a run of the method {run.method_name or 'unknown'}; expected a trained Splatfacto run"
@@ -144,8 +124,7 @@ def find_runs(folder: Path | str, need_data: bool = True) -> list[Run]:
         raise SceneError(
             f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
         )
-    runs = sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
-    return [open_run(run.folder, need_data) for run in runs] if need_data else runs
+    return sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
 
 
 def find_plys(folder: Path) -> list[tuple[str, Path]]:

@@ -15,7 +15,6 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -103,8 +102,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
     is removed.
 
     Missing parent folders are created. Through a symbolic link, its target is written. A file that is replaced keeps
-    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays, but
-    for :func:`never_replaced`.
+    its mode. Of several writers of one path, each has a temporary path of its own, and the last one's file stays.
 
     Args:
         path: the file.
@@ -132,7 +130,7 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
         yield part
         if mode is not None:
             part.chmod(mode)
-        (_put_new if path in _NEVER_REPLACED.get() else os.replace)(part, target)
+        os.replace(part, target)
     except OSError as error:
         why = error.strerror or one_line(error)
         raise SceneError(f"{path}: cannot be written ({why})") from error
@@ -140,33 +138,6 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
                 part.unlink()
-
-
-_NEVER_REPLACED: ContextVar[frozenset[Path]] = ContextVar("never_replaced", default=frozenset())
-
-
-@contextmanager
-def never_replaced(path: Path) -> Iterator[None]:
-    """Let :func:`replacing` fail if there is a file at ``path`` in the end."""
-    token = _NEVER_REPLACED.set(_NEVER_REPLACED.get() | {path})
-    try:
-        yield
-    finally:
-        _NEVER_REPLACED.reset(token)
-
-
-def _put_new(part: Path, target: Path) -> None:
-    """Give a file its name, unless there is another file of this name. A rename would replace that one.
-
-    Raises:
-        FileExistsError: if there is one.
-    """
-    try:
-        os.link(part, target)
-    except OSError:  # there is one, or the file system has no links
-        if os.path.lexists(target):
-            raise FileExistsError(errno.EEXIST, "another file of this name has appeared meanwhile") from None
-        os.replace(part, target)
 
 
 def target_of(path: Path) -> Path:

@@ -1,17 +1,12 @@
-"""Claims: a command holds the files and folders that it is going to write, from before its work until it ends."""
+"""Checks of the files and folders that a command is going to write, before its work."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+import os
 from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import never_replaced, one_line, target_of
-from pointsplat_ns.system.claims import claim
-
-LOCK_NAME = ".pointsplat.lock"
-"""Lock file in a claimed folder."""
+from pointsplat_ns.io.files import one_line, target_of
 
 
 def need_suffix(path: Path, suffix: str) -> None:
@@ -27,64 +22,29 @@ def need_new(path: Path, force: bool) -> None:
         raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
 
 
-@contextmanager
-def claimed(path: Path, force: bool = False) -> Iterator[None]:
-    """Hold a file that will be written, so that another process that claims it fails at once.
-
-    The lock is a hidden file beside it. The system releases it when the process ends, however that happens.
-
-    Args:
-        path: the file. Missing folders are created, and removed if they are empty in the end.
-        force: whether an existing file may be replaced. If not, a file that appears meanwhile is not replaced either
-            (:func:`~pointsplat_ns.io.files.never_replaced`).
-
-    Raises:
-        SceneError: if another process holds it, it cannot be written, it is a folder, a pipe or a device, or it exists
-            and may not be replaced.
-    """
-    name = path.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-    with ExitStack() as stack:
-        try:
-            target = target_of(path)
-            stack.enter_context(_locked(target.with_name(f".{name}.lock"), path))
-            need_new(path, force)
-        except OSError as error:
-            raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
-        if not force:
-            stack.enter_context(never_replaced(path))
-        yield
-
-
-@contextmanager
-def claimed_folder(path: Path) -> Iterator[None]:
-    """Hold a folder that will be written to, as :func:`claimed` holds a file.
-
-    Raises:
-        SceneError: if another process holds it, it is a file, or nothing can be written there.
-    """
-    with ExitStack() as stack:
-        try:
-            if path.exists() and not path.is_dir():
-                raise SceneError(f"{path}: is a file; expected the name of a folder")
-            stack.enter_context(_locked(path / LOCK_NAME, path))
-        except OSError as error:
-            raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
-        yield
-
-
-@contextmanager
-def _locked(lock: Path, output: Path) -> Iterator[None]:
-    missing = [folder for folder in lock.parents if not folder.exists()]
+def need_writable(path: Path, force: bool) -> None:
+    """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its folder takes none, or it
+    exists and ``force`` does not allow to replace it."""
     try:
-        with claim(lock) as held:
-            if not held:
-                raise SceneError(f"{output}: another process is writing it; wait for it, or name another output")
-            try:
-                yield
-            finally:
-                with suppress(OSError):  # Windows keeps a file that is open
-                    lock.unlink()
-    finally:
-        with suppress(OSError):  # the first that is not empty ends it
-            for folder in missing:
-                folder.rmdir()
+        need_new(path, force)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
+    _need_place(path, target_of(path).absolute().parent)
+
+
+def need_folder(path: Path) -> None:
+    """Raise a SceneError if nothing can be written to a folder, which may be missing."""
+    if os.path.lexists(path) and not path.is_dir():
+        raise SceneError(f"{path}: is a file; expected the name of a folder")
+    _need_place(path, path.absolute())
+
+
+def _need_place(path: Path, folder: Path) -> None:
+    """Raise a SceneError, about ``path``, if a folder cannot be written to, or cannot be made."""
+    try:
+        above = next(place for place in (folder, *folder.parents) if place.exists())
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be written ({error.strerror or one_line(error)})") from error
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        why = "is no folder" if not above.is_dir() else "takes no files"
+        raise SceneError(f"{path}: cannot be written ({above} {why})")

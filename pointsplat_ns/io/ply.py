@@ -20,18 +20,9 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset, Traits, sh_degree_of
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
-from pointsplat_ns.io.ply_dialects import (
-    COLORS,
-    COLUMNS,
-    FILTER,
-    attributes_of,
-    columns_of,
-    has_plain_colors,
-    is_flat,
-)
+from pointsplat_ns.io.ply_dialects import COLUMNS, FILTER, attributes_of, columns_of, is_flat
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 from pointsplat_ns.io.ply_writing import column_names
-from pointsplat_ns.io.usable import keep_usable
 
 MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Number of SH coefficients per channel beyond the constant one that are read."""
@@ -41,17 +32,15 @@ def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
-    Gaussians, which have no ``scale_2``, become flat ones. Names with CloudCompare's prefixes, colours as red, green
-    and blue, and Mip-Splatting's 3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties
-    and elements, and bytes after the last element, are not read; a warning says so. Gaussians that cannot be drawn
-    (NaN, or Inf where it is not valid) are dropped, and their number is logged; all-zero rows are kept (a zero
-    quaternion is the identity).
+    Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of names, and Mip-Splatting's
+    3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties and elements, and bytes after the
+    last element, are not read; a warning says so.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
     """
     rows = PlyRows(path, whole=True)
-    return keep_usable(rows.read(0, len(rows)), path)
+    return rows.read(0, len(rows))
 
 
 class PlyRows:
@@ -166,7 +155,7 @@ class PlyRows:
                 for name, fields in columns.items():
                     if fields and not (name == "means" and self._shift is not None):
                         tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
-        tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, self._dtype).items()}
+        tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, self._names).items()}
         tensors["features_rest"] = tensors["features_rest"].reshape(count, self.rest, 3)
         antialiased, up, offset = self.traits
         return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
@@ -241,9 +230,6 @@ def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) ->
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
     known = {name for names in COLUMNS.values() for name in names} | {FILTER}
     present = {name for name, _ in vertex.properties}
-    if has_plain_colors(present):
-        known |= {*COLORS}
-        logger.info("%s: colours are those of 'red', 'green' and 'blue'", path)
     if FILTER in present:
         logger.info("%s: Mip-Splatting's 3D filter is put into sizes and opacities", path)
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
@@ -272,8 +258,6 @@ def _num_rest(vertex: Element, path: Path) -> int:
     if is_flat(present):
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")
-    if has_plain_colors(present):
-        present |= {*COLUMNS["features_dc"]}
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
     counts = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]
     required = column_names(rest[-1] + 1 if rest and rest[-1] + 1 in counts else 0)

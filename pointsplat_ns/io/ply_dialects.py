@@ -1,8 +1,7 @@
-"""3DGS PLYs as other programs write them: names with prefixes, colours as red, green and blue, and 3D filters.
+"""3DGS PLYs as other programs write them: 2D Gaussians, and 3D filters.
 
-CloudCompare puts ``scalar_`` (or ``scal_``, or both) before the name of each property that it does not know. ns-export
-writes colours as bytes if asked to. Mip-Splatting keeps the size of its 3D filter beside the sizes that it was trained
-with; the filter belongs to the scene, and its own ``create_fused_ply.py`` fuses both.
+Mip-Splatting keeps the size of its 3D filter beside the sizes that it was trained with; the filter belongs to the
+scene, and its own ``create_fused_ply.py`` fuses both.
 """
 
 from __future__ import annotations
@@ -11,9 +10,6 @@ from collections.abc import Container
 
 import numpy as np
 from numpy.typing import NDArray
-
-from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import logger
 
 Table = NDArray[np.float32]
 
@@ -27,7 +23,6 @@ COLUMNS = {
 }
 """Vertex properties of the attributes; normals are written as zeros and not read."""
 
-COLORS = ["red", "green", "blue"]
 FILTER = "filter_3D"
 
 
@@ -36,42 +31,23 @@ def is_flat(names: Container[str]) -> bool:
     return "scale_2" not in names and all(name in names for name in ("scale_0", "scale_1", "opacity"))
 
 
-def has_plain_colors(names: Container[str]) -> bool:
-    """Whether vertex properties have colours as red, green and blue alone."""
-    return "f_dc_0" not in names and all(name in names for name in COLORS)
-
-
 def columns_of(names: Container[str]) -> dict[str, list[str]]:
     """The vertex properties to read for each attribute but ``features_rest``, and for the 3D filter."""
     return {
-        **{name: COLUMNS[name] for name in ("means", "quats", "opacities")},
+        **{name: COLUMNS[name] for name in ("means", "quats", "opacities", "features_dc")},
         "scales": COLUMNS["scales"][: 2 if is_flat(names) else 3],
-        "features_dc": COLORS if has_plain_colors(names) else COLUMNS["features_dc"],
         FILTER: [FILTER] if FILTER in names else [],
     }
 
 
-def attributes_of(tables: dict[str, Table], kinds: np.dtype) -> dict[str, Table]:
-    """The attributes of a scene, float32, of what :func:`columns_of` named, float32, from rows of these types."""
-    names = kinds.names or ()
+def attributes_of(tables: dict[str, Table], names: Container[str]) -> dict[str, Table]:
+    """The attributes of a scene, float32, of what :func:`columns_of` named, float32."""
     found = {name: table for name, table in tables.items() if name != FILTER}
     if FILTER in names:
         found["scales"], found["opacities"] = fuse_filter(found["scales"], found["opacities"], tables[FILTER])
-    if has_plain_colors(names):
-        found["features_dc"] = _dc_of_colors(found["features_dc"], kinds["red"])
     if is_flat(names):
         found["scales"] = np.column_stack([found["scales"], np.full(len(found["scales"]), -np.inf, np.float32)])
     return found
-
-
-def _dc_of_colors(colors: Table, kind: np.dtype) -> Table:
-    """Constant SH coefficients (N, 3) of red, green and blue (N, 3): whole numbers count in the largest of their type,
-    others are in [0, 1]."""
-    largest = np.iinfo(kind).max if kind.kind in "iu" else 1
-    top = float(np.nanmax(colors, initial=0)) / largest
-    if top > 1:
-        logger.warning("'red', 'green' and 'blue' are %s up to %g, read as shares of 1; expected at most 1", kind, top)
-    return ((colors / np.float32(largest) - np.float32(0.5)) / np.float32(SH_C0)).astype(np.float32)
 
 
 def fuse_filter(scales: Table, opacities: Table, sizes: Table) -> tuple[Table, Table]:

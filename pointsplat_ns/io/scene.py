@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, logger, never_replaced, one_line, require_file
+from pointsplat_ns.io.files import content_hash, logger, one_line, require_file
 from pointsplat_ns.io.formats import (
     READABLE,
     SOG_META,
@@ -25,13 +25,13 @@ from pointsplat_ns.io.formats.holding import losses
 from pointsplat_ns.io.formats.sog_stream import stream_parts
 from pointsplat_ns.io.offsets import warn_if_far
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
-from pointsplat_ns.io.splatfacto import checkpoint_parts, open_checkpoint, read_checkpoint
+from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, progress_bar, silent
 
 SCENE_KINDS = (
-    f"a scene ({READABLE}, or a zip of a PLY), a checkpoint of Splatfacto, gsplat or 3DGS (.ckpt, .pt, .pth), or a "
-    "Splatfacto run (its folder or config.yml)"
+    f"a scene ({READABLE}), a checkpoint of Splatfacto or gsplat (.ckpt, .pt), or a Splatfacto run (its folder or "
+    "config.yml)"
 )
 
 
@@ -48,18 +48,20 @@ def is_folder_of_scenes(path: Path | str) -> bool:
     return path.is_dir() and not (path / RUN_FILES.config).is_file() and format_to_read(path) is None
 
 
-def read_scene(path: Path | str) -> Gaussians:
+def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
     """Read a scene: a file of any format, a checkpoint, or the newest checkpoint of a Splatfacto run.
 
+    Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are dropped, and their number is logged.
     Positions that are doubles far from the origin, as in geo-referenced PLYs, are read relative to an offset, which is
     that of the scene. Where float32 has lost their digits already, that is logged.
     The content of a file decides its format, else its name.
 
     Args:
         path: a 3DGS or compressed ``.ply``, ``.spz``, ``.sog`` (or its folder, or the ``meta.json`` in it), a streamed
-            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, ``.ksplat``,
-            ``.glb``, a zip of a PLY, a checkpoint of Splatfacto (``.ckpt``), gsplat (``.pt``) or 3DGS (``.pth``),
-            ``config.yml`` or a run's folder. The photos of a run are not needed.
+            SOG (``lod-meta.json`` or its folder, of which the finest level is read), ``.splat``, a checkpoint of
+            Splatfacto (``.ckpt``) or gsplat (``.pt``), ``config.yml`` or a run's folder. The photos of a run are not
+            needed.
+        all_rows: whether Gaussians that cannot be drawn are kept.
 
     Returns:
         The scene, float32 on the CPU. Log-scales and logits are those of the file.
@@ -82,6 +84,8 @@ def read_scene(path: Path | str) -> Gaussians:
     else:
         assert found.read is not None
         scene = found.read(path)
+    if not all_rows:
+        scene = keep_usable(scene, found.checkpoint if isinstance(found, Run) else path)
         warn_if_far(scene, path)
     return scene if run is None else scene.replace(antialiased=run.rasterize_mode == "antialiased")
 
@@ -111,8 +115,8 @@ def _run_around(path: Path, kind: Format) -> Run | None:
 
 
 def kind_of(path: Path | str) -> str:
-    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run or a checkpoint with
-    its program or method and its step. Raises SceneError as :func:`read_scene`.
+    """What a path is that :func:`read_scene` reads: the name of a format, such as "SPZ", or a run or a checkpoint in
+    one with its method and step. Raises SceneError as :func:`read_scene`.
 
     Example:
         >>> from pathlib import Path
@@ -126,19 +130,16 @@ def kind_of(path: Path | str) -> str:
     if run is not None:
         what = "run" if found is run else "checkpoint"
         return f"{what} of {run.method_name or 'an unknown method'}, step {run.step}"
-    if isinstance(found, Format) and found.read is not read_checkpoint:
-        return found.name
-    opened = open_checkpoint(path)
-    return f"checkpoint of {opened.program}" + ("" if opened.step is None else f", step {opened.step}")
+    assert isinstance(found, Format)
+    return found.name
 
 
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:
     """Write a scene in the format that the path's name asks for.
 
-    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. The others keep fewer bits:
-    ``.compressed.ply``, ``.spz`` (version 3), ``.sog``, ``meta.json`` (the same in a folder), ``.splat``; ``.glb`` is
-    glTF, exact to rounding. Gaussians that cannot be drawn (NaN, or Inf where it is not
-    valid) are left out, and their number is logged. The file appears whole or not at all.
+    ``.ply`` is the 3DGS PLY: a float32 scene is read back unchanged to the bit. ``.spz`` (version 3), ``.sog`` and
+    ``.splat`` keep fewer bits. Gaussians that cannot be drawn (NaN, or Inf where it is not valid) are left out, and
+    their number is logged. The file appears whole or not at all.
 
     Args:
         scene: N Gaussians of SH degree d, on any device and of any floating dtype. In a PLY each takes 68 + 12 K bytes,
@@ -162,7 +163,7 @@ def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, 
     kind = format_to_write(path)
     if path.is_file() and not overwrite:
         raise SceneError(f"{path}: exists already; name another file, or replace it with overwrite=True")
-    with progress_bar(progress) as report, nullcontext() if overwrite else never_replaced(path):
+    with progress_bar(progress) as report:
         save_as(kind, scene, path, report)
 
 
@@ -181,16 +182,16 @@ def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
     """Log what a format does not hold of a scene, float32 on the CPU, and which format does."""
     found = losses(scene, kind.capacity)
     if found:
-        others = (format_named(suffix) for suffix in (".sog", ".glb", ".ply"))
+        others = (format_named(suffix) for suffix in (".sog", ".ply"))
         keeper = next(other.suffix for other in others if other is not None and not losses(scene, other.capacity))
         logger.warning("%s: lost in %s: %s; %s keeps it", name, kind.name, "; ".join(found), keeper)
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """The file that a dense scene was read from. Of a SOG folder, streamed or not, and of a checkpoint in parts,
-    ``name`` is that of the folder, ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of
-    each, by its path in the folder."""
+    """The file that a dense scene was read from. Of a SOG folder, streamed or not, ``name`` is that of the folder,
+    ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of each, by its path in the
+    folder."""
 
     name: str
     bytes: int
@@ -211,15 +212,15 @@ def source_file(path: Path | str) -> SourceFile:
 
 
 def source_parts(path: Path | str) -> list[Path]:
-    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, all
-    parts of a checkpoint, or one. Raises SceneError if a run has none, or a folder cannot be read."""
+    """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, or
+    one. Raises SceneError if a run has none, or a folder cannot be read."""
     path = Path(path)
     parts = _sog_parts(path)
     if parts:
         return parts
     if may_be_run(path) and not (path.is_file() and format_to_read(path)):
         return [open_run(path, need_data=False).checkpoint]
-    return checkpoint_parts(path)
+    return [path]
 
 
 def _sog_parts(path: Path) -> list[Path]:

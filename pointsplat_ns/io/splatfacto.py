@@ -1,5 +1,4 @@
-"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``), gsplat's (``ckpts/ckpt_*_rank0.pt``) and INRIA's
-(``chkpnt*.pth``)."""
+"""Checkpoints: Splatfacto's (``nerfstudio_models/step-*.ckpt``) and gsplat's (``ckpts/ckpt_*_rank0.pt``)."""
 
 from __future__ import annotations
 
@@ -16,85 +15,36 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, PARAMETERS, Gaussians
+from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import logger, one_line, read_text, require_file, require_memory
-from pointsplat_ns.io.usable import keep_usable
+from pointsplat_ns.io.files import one_line, read_text, require_file, require_memory
 
-EXPECTED = "expected a checkpoint that Splatfacto, gsplat or 3D Gaussian Splatting saved"
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """The content of a checkpoint."""
-
-    program: str
-    """The program that saved it: Splatfacto, gsplat or 3DGS."""
-    step: int | None
-    """Steps of the training, as the program counts them; None if it does not say."""
-    values: dict[str, Any]
-    """The parameters by their names in :data:`~pointsplat_ns.gaussians.PARAMETERS`, each with its key in the file."""
+EXPECTED = "expected a checkpoint that Splatfacto or gsplat saved"
 
 
 def read_checkpoint(path: Path | str) -> Gaussians:
-    """Read the scene of a checkpoint of Splatfacto, of gsplat's trainer, or of INRIA's 3D Gaussian Splatting.
+    """Read the scene of a checkpoint of Splatfacto, or of gsplat's trainer.
 
     Loads with ``weights_only=True``: a checkpoint cannot run code. At SH degree 0, where Splatfacto stores colours as
-    logits, they are converted to SH coefficients of the same colour. Of gsplat's trainings on several GPUs all parts
-    are read, and the ``cfg.yml`` of the training says whether it drew antialiased. Of 3D Gaussian Splatting the bands
-    of SH are read that the training drew at that step. Gaussians that cannot be drawn (NaN, or Inf where it is not
-    valid) are dropped, and their number is logged.
+    logits, they are converted to SH coefficients of the same colour. The ``cfg.yml`` of a training with gsplat says
+    whether it drew antialiased.
 
     Returns:
         The scene, float32 on the CPU, in the frame of the training: for Splatfacto that of the run's dataparser.
 
     Raises:
-        SceneError: if the file is truncated, is no checkpoint, or is one of another method.
+        SceneError: if the file is truncated, is no checkpoint, is one of another method, or a part of one.
     """
     path = require_file(path, "a checkpoint")
-    parts = []
-    for part in checkpoint_parts(path):
-        found = open_checkpoint(part)
-        antialiased = found.program == "gsplat" and _gsplat_antialiased(part)
-        parts.append(_scene_of(found, part).replace(antialiased=antialiased))
-    if found.program == "gsplat" and re.fullmatch(r"ckpt_\d+\.pt", path.name):
-        logger.warning("%s: read as 3D Gaussians; simple_trainer_2dgs.py saves 2D ones under such names, too", path)
-    if len({part.sh_degree for part in parts}) > 1:
-        raise SceneError(f"{path}: its parts have different SH degrees; expected those of one training")
-    if len(parts) > 1:
-        logger.info("%s: %d parts of a training on several GPUs are joined", path, len(parts))
-    return keep_usable(Gaussians.cat(parts) if len(parts) > 1 else parts[0], path)
-
-
-def checkpoint_parts(path: Path) -> list[Path]:
-    """The files of a checkpoint: one for each GPU of a training with gsplat, ``ckpt_STEP_rankNUMBER.pt``, else one.
-    Raises SceneError if one of them is missing."""
-    named = re.fullmatch(r"(ckpt_\d+_rank)\d{1,6}\.pt", path.name)
-    if named is None:
-        return [path]
-    pattern = re.compile(re.escape(named[1]) + r"(\d{1,6})\.pt")
-    try:
-        ranks = {int(found[1]): file for file in path.parent.iterdir() if (found := pattern.fullmatch(file.name))}
-    except OSError as error:
-        raise SceneError(f"{path.parent}: cannot be read ({error.strerror or one_line(error)})") from error
-    if path.name not in {file.name for file in ranks.values()}:
-        return [path]
-    missing = sorted({*range(max(ranks))} - ranks.keys())
-    if missing:
+    named = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
+    if named is not None and path.with_name(f"{named[1]}1.pt").exists():
         raise SceneError(
-            f"{path}: a part of a training on several GPUs, and {named[1]}{missing[0]}.pt is missing; expected all "
-            "parts in one folder"
+            f"{path}: a part of a training on several GPUs; expected the whole scene; export a PLY with --save_ply"
         )
-    return [require_file(ranks[rank], "a part of a checkpoint") for rank in sorted(ranks)]
-
-
-def open_checkpoint(path: Path) -> Checkpoint:
-    """The content of a checkpoint, its tensors not yet checked. Raises SceneError as :func:`read_checkpoint`."""
     content = _load(path)
-    if isinstance(content, (tuple, list)) and len(content) == 2 and isinstance(content[0], (tuple, list)):
-        return _of_3dgs(content[0], content[1], path)
-    if isinstance(content, dict) and isinstance(content.get("splats"), dict):
-        return _of_gsplat(content["splats"], content.get("step"), path)
+    if isinstance(content, dict) and isinstance(content.get("splats"), dict):  # of gsplat's simple_trainer
+        scene = _scene_of_gsplat(content["splats"], path)
+        return scene.replace(antialiased=_gsplat_antialiased(path))
     state = _pipeline_state(content, path)
     # Of current versions, and of those before nerfstudio 1.0, each also with the wrapper of distributed training.
     prefixes = ("_model.gauss_params.", "_model.module.gauss_params.", "_model.", "_model.module.")
@@ -104,23 +54,10 @@ def open_checkpoint(path: Path) -> Checkpoint:
             f"{path}: a checkpoint of another method; found the keys {_some(state, 4)}; "
             f"expected {prefixes[0]}means, as Splatfacto saves"
         )
-    return Checkpoint(
-        "Splatfacto",
-        _step(content.get("step")),
-        {name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS},
-    )
-
-
-def _of_gsplat(splats: dict[str, Any], step: Any, path: Path) -> Checkpoint:
-    """``{"step": ..., "splats": {means, scales, quats, opacities, sh0, shN}}``, as gsplat's simple_trainer saves."""
-    if "features" in splats and "colors" in splats:
-        raise SceneError(
-            f"{path}: trained by gsplat with appearance optimisation (--app_opt), so that its colours come from a "
-            "network (keys 'features' and 'colors'); expected the SH coefficients sh0 and shN; export a PLY with "
-            "--save_ply, or train without --app_opt"
-        )
-    keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
-    return Checkpoint("gsplat", _step(step), {name: (key, splats.get(key)) for name, key in keys.items()})
+    scene = _scene_of({name: (prefix + name, state.get(prefix + name)) for name in PARAMETERS}, path)
+    if scene.sh_degree == 0:
+        scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
+    return scene
 
 
 def _gsplat_antialiased(path: Path) -> bool:
@@ -133,62 +70,26 @@ def _gsplat_antialiased(path: Path) -> bool:
     return re.search(r"^antialiased: true\s*$", text, re.M) is not None
 
 
-def _of_3dgs(captured: Any, step: Any, path: Path) -> Checkpoint:
-    """``(GaussianModel.capture(), iteration)``, as INRIA's training saves: twelve entries, of which the first is the
-    active SH degree, and the next are parameters."""
-    names = ("active SH degree", "means", "features_dc", "features_rest", "scales", "quats", "opacities")
-    degree = captured[0] if len(captured) == 12 else None
-    if not isinstance(degree, int) or not 0 <= degree <= 4:
-        raise SceneError(
-            f"{path}: a tuple of {len(captured)} entries and a step; expected the twelve of 3D Gaussian Splatting's "
-            "capture(), the active SH degree first; name the training's PLY instead"
-        )
-    values = dict(zip(names, captured, strict=False))
-    rest = values["features_rest"]
-    if isinstance(rest, Tensor) and rest.dim() == 3:
-        values["features_rest"] = rest[:, : (degree + 1) ** 2 - 1]
-    return Checkpoint("3DGS", _step(step), {name: (name, values[name]) for name in PARAMETERS})
+def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
+    """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
+    keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
+    held = {name: splats.get(key) for name, key in keys.items()}
+    if isinstance(opacities := held["opacities"], Tensor) and opacities.dim() == 1:
+        held["opacities"] = opacities[:, None]
+    if isinstance(dc := held["features_dc"], Tensor) and dc.dim() == 3 and dc.shape[1] == 1:
+        held["features_dc"] = dc[:, 0]
+    return _scene_of({name: (key, held[name]) for name, key in keys.items()}, path)
 
 
-def _scene_of(found: Checkpoint, path: Path) -> Gaussians:
-    """The scene of a checkpoint's parameters, those that cannot be drawn included."""
+def _scene_of(values: dict[str, tuple[str, Any]], path: Path) -> Gaussians:
+    """The scene of parameters, each with its key in the file; those that cannot be drawn included."""
     limit = path.stat().st_size
-    held = (value for _, value in found.values.values())
-    require_memory(path, min(limit, sum(4 * value.numel() for value in held if _is_dense(value))))
-    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in found.values.items()}
-    if found.program != "Splatfacto":
-        tensors = _reshaped(tensors, path)
+    require_memory(path, min(limit, sum(4 * value.numel() for _, value in values.values() if _is_dense(value))))
+    tensors = {name: _parameter(value, key, path, limit) for name, (key, value) in values.items()}
     try:
-        scene = Gaussians(*(tensors[name] for name in PARAMETERS))
+        return Gaussians(*(tensors[name] for name in PARAMETERS))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
-    if found.program == "Splatfacto" and scene.sh_degree == 0:
-        scene = scene.replace(features_dc=(torch.sigmoid(scene.features_dc) - 0.5) / SH_C0)
-    return scene
-
-
-def _reshaped(tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Parameters of gsplat and of 3DGS in the shapes of :class:`Gaussians`: opacities (N,) or (N, 1), constant SH
-    coefficients (N, 1, 3), SH of degree 4, and two sizes of 2D Gaussians, whose third axis is flat."""
-    opacities, dc, scales = (tensors[name] for name in ("opacities", "features_dc", "scales"))
-    most = (MAX_SH_DEGREE + 1) ** 2 - 1
-    rest = tensors["features_rest"]
-    if rest.dim() == 3 and rest.shape[1] == (MAX_SH_DEGREE + 2) ** 2 - 1:
-        logger.warning("%s: SH degree %d, read up to degree %d", path, MAX_SH_DEGREE + 1, MAX_SH_DEGREE)
-        rest = rest[:, :most].contiguous()
-    if scales.dim() == 2 and scales.shape[1] == 2:
-        logger.warning("%s: 2D Gaussians, read as flat 3D ones", path)
-        scales = torch.cat([scales, torch.full_like(scales[:, :1], -torch.inf)], dim=1)
-    return tensors | {
-        "opacities": opacities[:, None] if opacities.dim() == 1 else opacities,
-        "features_dc": dc[:, 0] if dc.dim() == 3 and dc.shape[1] == 1 else dc,
-        "features_rest": rest,
-        "scales": scales,
-    }
-
-
-def _step(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
 
 
 def _some(keys: Iterable[Any], count: int) -> str:
@@ -241,14 +142,14 @@ def is_complete(path: Path) -> bool:
 
 
 def allow_splatfacto_checkpoints() -> None:
-    """Register numpy's float64 and float32 scalars with torch's ``weights_only`` loader, if they are not.
+    """Register numpy's float64 scalars with torch's ``weights_only`` loader, if they are not.
 
-    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers, and one of 3D Gaussian Splatting in
-    its optimiser. The functions registered here rebuild it from its bytes; they cannot run code from the file.
+    Every Splatfacto checkpoint holds such a scalar in the state of its schedulers. The functions registered here
+    rebuild it from its bytes; they cannot run code from the file.
     """
     # numpy 2 renamed the module.
     scalar = importlib.import_module(f"numpy.{'_core' if hasattr(np, '_core') else 'core'}.multiarray").scalar
-    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    allowed: list[Any] = [np.dtype, type(np.dtype(np.float64))]
     # A checkpoint may come from the other major version of numpy, so register the function under both names.
     allowed += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     present = torch.serialization.get_safe_globals()
@@ -287,8 +188,8 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         found = _some(content, 6) if isinstance(content, dict) else type(content).__name__
         raise SceneError(
-            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of nerfstudio, 'splats' "
-            "of gsplat, or the tuple of 3D Gaussian Splatting"
+            f"{path}: not a checkpoint of a scene; found {found}; expected the key 'pipeline' of nerfstudio, or "
+            "'splats' of gsplat"
         )
     return state
 

@@ -1,26 +1,11 @@
-"""Scenes as readers and writers keep them: without the Gaussians that cannot be drawn."""
+"""Scenes as they are read and written: without the Gaussians that cannot be drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
-
-_everything: ContextVar[bool] = ContextVar("everything", default=False)
-
-
-@contextmanager
-def unusable_kept() -> Iterator[None]:
-    """Let readers keep Gaussians that cannot be drawn, for those who count them."""
-    token = _everything.set(True)
-    try:
-        yield
-    finally:
-        _everything.reset(token)
 
 
 def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
@@ -29,8 +14,6 @@ def keep_usable(scene: Gaussians, path: Path | str) -> Gaussians:
     Opacity logits of +-Inf (opacity 1 and 0) and log-scales of -Inf (a flat axis) can be drawn (see
     :meth:`~pointsplat_ns.gaussians.Gaussians.usable`). They become +-30 and -87, which draw the same in float32.
     """
-    if _everything.get():
-        return scene
     usable = usable_part(scene)
     dropped = len(scene) - len(usable)
     if dropped:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_to_write
+from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.levels.folder import check_folder
@@ -50,7 +50,7 @@ def write_stream(
     check_folder(folder, (STREAM_META,), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
     if scenes:
-        warn_of_losses(format_to_write(SOG_META), scenes[0], folder)
+        warn_of_losses(format_to_write(".sog"), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
     return write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]

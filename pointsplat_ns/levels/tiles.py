@@ -17,7 +17,7 @@ from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.glb_writing import TILE_EXTENSIONS, encode_tile
+from pointsplat_ns.io.formats.glb_tile import TILE_EXTENSIONS, encode_tile
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.offsets import from_centre
 from pointsplat_ns.io.scene import warn_of_losses

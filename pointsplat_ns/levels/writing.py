@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -10,7 +9,7 @@ from typing import Literal
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
-from pointsplat_ns.io.outputs import claimed, claimed_folder
+from pointsplat_ns.io.outputs import need_folder, need_writable
 from pointsplat_ns.levels.folder import check_folder, level_names
 from pointsplat_ns.levels.levels import Levels
 from pointsplat_ns.levels.tiles import TILESET
@@ -47,13 +46,13 @@ class LevelOutput:
         form: Form = "stream" if stream else "tiles" if tiles else "paged" if paged else "folder"
         return LevelOutput(Path(path), form, at, up, force)
 
-    def claim(self, count: int) -> AbstractContextManager[object]:
-        """Check that ``count`` levels can be written; no other program writes there while the context is open."""
+    def check(self, count: int) -> None:
+        """Check that ``count`` levels can be written."""
         if self.form == "paged":
-            return claimed(self.path, self.force)
+            return need_writable(self.path, self.force)
         names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[self.form]
         check_folder(self.path, names, self.force)
-        return claimed_folder(self.path)
+        need_folder(self.path)
 
     def write(self, levels: Levels, progress: Progress) -> Levels:
         """Write levels; those of a stream are then judged as they are in its files."""

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import BudgetError, PointSplatError
+from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
@@ -110,9 +110,7 @@ def merge_file(
             """Take a step of every cell."""
             progress(what, 0.0)
             steps = [(step, cell, *args) for cell in range(len(cells))]
-            for done, (_, killed) in enumerate(workers.results(steps), 1):
-                if killed is not None:
-                    raise PointSplatError(f"{what}: {killed}; the same command resumes, with fewer --jobs if need be")
+            for done, _ in enumerate(workers.results(steps), 1):
                 progress(what, done / len(cells))
 
         rounds, left = 0, -1

@@ -26,7 +26,7 @@ from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.scene_folder import SceneResult
+    from pointsplat_ns.folders import SceneResult
 
 WIDTH, HEIGHT = 640, 400
 """Size of one picture of a pair, pixels."""

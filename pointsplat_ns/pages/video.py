@@ -13,7 +13,6 @@ import numpy as np
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.io.outputs import LOCK_NAME
 
 Kind = Literal["video", "frames", "picture"]
 
@@ -42,7 +41,7 @@ def check_output(output: Path | str, force: bool) -> Kind:
     not be overwritten."""
     path, kind = Path(output), kind_of(output)
     if kind == "frames" and path.exists():
-        found = sorted({item.name for item in path.iterdir()} - {LOCK_NAME}) if path.is_dir() else [path.name]
+        found = sorted(item.name for item in path.iterdir()) if path.is_dir() else [path.name]
         others = [name for name in found if not _FRAME.fullmatch(name)]
         if others or not path.is_dir():
             raise SceneError(f"{path}: holds {(others or found)[0]}; expected a new folder, or one of frames")

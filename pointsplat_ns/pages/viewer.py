@@ -25,9 +25,7 @@ from pointsplat_ns.pages.kept import Level, ViewedScene
 from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
 
-READABLE_NAMES = (
-    *(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt", ".pth", ".zip",
-)  # fmt: skip
+READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt")
 """Ends of the names of files that may be dropped."""
 
 LARGEST_FILE = 4_000_000_000

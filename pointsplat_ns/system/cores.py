@@ -21,29 +21,9 @@ def _allowed() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
 
 
-class OtherPrograms:
-    """Measures the mean number of cores that other programs take from this process from now on."""
-
-    def __init__(self) -> None:
-        self._before = self._read()
-
-    @staticmethod
-    def _read() -> tuple[float, float, float, float]:
-        """Seconds of the clock and of this process on cores, and what :func:`_machine` tells."""
-        return time.monotonic(), time.process_time(), *_machine()
-
-    def cores(self) -> float:
-        """Mean number of cores, at most :func:`cores`. What others use of a machine counts only where the rest is less
-        than a quota allows this process."""
-        (start, own_before, _, before), (end, own_after, limit, after) = self._before, self._read()
-        if end <= start:
-            return 0.0
-        others = max(0.0, after - before - (own_after - own_before)) / (end - start)
-        return min(max(0.0, cores() - (limit - others)), float(cores()))
-
-
-def _machine() -> tuple[float, float]:
-    """The cores that this process may be scheduled on, and the seconds used of them; 0 if they are unknown."""
+def _usage() -> tuple[float, float, int, float]:
+    """Seconds of the clock, and of this process on cores; the number of cores that it may be scheduled on, and the
+    seconds used of them by all programs, 0 if they are unknown."""
     import psutil
 
     allowed = _allowed()
@@ -52,13 +32,24 @@ def _machine() -> tuple[float, float]:
     except (OSError, psutil.Error):
         times = []
     seen = [times[number] for number in allowed if number < len(times)]  # a container may be shown fewer
-    return float(len(seen) or len(allowed)), float(sum(_busy(each) for each in seen))
+    # Time of guests is part of the user time, too.
+    not_busy = ("idle", "iowait", "guest", "guest_nice")
+    busy = sum(sum(each) - sum(getattr(each, name, 0.0) for name in not_busy) for each in seen)
+    return time.monotonic(), time.process_time(), len(seen) or len(allowed), busy
 
 
-def _busy(times) -> float:
-    idle = times.idle + getattr(times, "iowait", 0.0)
-    guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # also part of the user time
-    return sum(times) - idle - guests
+class OtherPrograms:
+    """Measures the mean number of cores that other programs take from this process from now on."""
+
+    def __init__(self) -> None:
+        self.before = _usage()
+
+    def cores(self) -> float:
+        """Mean number of cores, at most :func:`cores`. What others use of a machine counts only where the rest is less
+        than a quota allows this process."""
+        (start, own_before, _, before), (end, own_after, limit, after) = self.before, _usage()
+        others = max(0.0, after - before - (own_after - own_before)) / max(end - start, 1e-9)
+        return min(max(0.0, cores() - (limit - others)), float(cores()))
 
 
 class FreeCores:
@@ -70,17 +61,17 @@ class FreeCores:
 
     def __init__(self) -> None:
         self._others: OtherPrograms | None = None
-        self._looked, self._count = -math.inf, 1
+        self._count = 1
 
     def __call__(self) -> int:
         """The number as the latest look found it, at least 1."""
-        if time.monotonic() - self._looked >= 1.0:  # seconds; a look takes a millisecond
-            others = self._others
-            if others is None:
-                others = OtherPrograms()
-                time.sleep(0.1)  # the system counts time in hundredths of a second
-            self._count = max(1, cores() - round(others.cores()))
-            self._others, self._looked = OtherPrograms(), time.monotonic()
+        if self._others is None:
+            self._others = OtherPrograms()
+            time.sleep(0.1)  # the system counts time in hundredths of a second
+        elif time.monotonic() - self._others.before[0] < 1.0:  # seconds; a look takes a millisecond
+            return self._count
+        self._count = max(1, cores() - round(self._others.cores()))
+        self._others = OtherPrograms()
         return self._count
 
 

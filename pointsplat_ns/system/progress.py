@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import functools
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import IO, Any, TypeVar
 
 Progress = Callable[[str, float], None]
@@ -43,8 +42,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
     if not console.is_jupyter and (console.is_dumb_terminal or not console.is_terminal):
-        with _lines(console.file) as show:
-            yield show
+        yield _lines(console.file)
         return
     with Bar(*columns, console=console, transient=True) as bar:
         tasks: dict[str, Any] = {}
@@ -59,32 +57,22 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
         yield show
 
 
-@contextmanager
-def _lines(stream: IO[str]) -> Iterator[Progress]:
-    """Write what is being done to ``stream``, every :data:`LINE_SECONDS` seconds until the context is left. A thread
-    writes, so that a step that reports nothing for minutes does not look like a program that hangs."""
-    start, ended, current = time.monotonic(), threading.Event(), ["starting"]
+def _lines(stream: IO[str]) -> Progress:
+    """Writes what is being done to ``stream``, every :data:`LINE_SECONDS` seconds."""
+    start = written = time.monotonic()
     begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
 
-    def write() -> None:
-        while not ended.wait(LINE_SECONDS):
-            try:
-                print(f"[{_clock(time.monotonic() - start)}] {current[0]}", file=stream, flush=True)
-            except (OSError, ValueError):  # nobody reads any more: the work goes on
-                return
-
     def show(what: str, share: float) -> None:
+        nonlocal written
         now = time.monotonic()
         start_of_task, before = begun.setdefault(what, (now, share))
-        current[0] = f"{what}: {100 * share:.0f} %{_left(share, share - before, now - start_of_task)}"
+        if now - written < LINE_SECONDS:
+            return
+        written, left = now, _left(share, share - before, now - start_of_task)
+        with suppress(OSError, ValueError):  # nobody reads any more: the work goes on
+            print(f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}", file=stream, flush=True)
 
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
-    try:
-        yield show
-    finally:
-        ended.set()
-        writer.join()
+    return show
 
 
 def _left(share: float, gained: float, taken: float) -> str:

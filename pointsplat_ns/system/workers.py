@@ -1,8 +1,4 @@
-"""Work that several processes of this machine share.
-
-Processes are those of :mod:`concurrent.futures`, one in each pool: a pool that breaks then names the item at which its
-process was killed, and the other processes go on.
-"""
+"""Work that several processes of this machine share, by :mod:`concurrent.futures`."""
 
 from __future__ import annotations
 
@@ -11,9 +7,8 @@ import os
 import pickle
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection, get_context, util
@@ -29,10 +24,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class WorkerKilled(PointSplatError):
-    """The process that worked on an item was killed twice, as the system does where memory is short."""
-
-
 class Workers(Generic[Item, Result]):
     """Processes that call a function with one item after the other, and share the cores. With one job, this process
     does. When the context is left, or this process ends, the others end at once, whatever they do.
@@ -44,57 +35,38 @@ class Workers(Generic[Item, Result]):
 
     def __init__(self, function: Callable[[Item], Result], jobs: int):
         self._function, self._jobs = function, jobs
-        self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
-        self._context = get_context("spawn")
-        self._ends, self._held = self._context.Pipe(duplex=False)
 
     def __enter__(self) -> Workers[Item, Result]:
+        if self._jobs > 1:
+            context = get_context("spawn")
+            ends, self._held = context.Pipe(duplex=False)
+            function = pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
+            with _started_safely(threads_for(self._jobs)):  # a pool starts multiprocessing's tracker of resources
+                self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._held.close()  # which all processes notice
-        for pool in [*self._idle, *(pool for pool, _ in self._busy.values())]:
-            pool.shutdown()
-        self._ends.close()
+        if self._jobs > 1:
+            self._held.close()  # which all processes notice
+            self._pool.shutdown(cancel_futures=True)
 
-    def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result | WorkerKilled]]:
-        """Each item with its result, in the order in which they are made. An item whose process is killed is tried
-        once more; if that one is killed too, its result is the error. Raises what the function raises."""
+    def results(self, items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+        """Each item with its result, in the order in which they are made. Raises what the function raises, and
+        PointSplatError if a process is killed."""
         if self._jobs == 1:
             for item in items:
                 yield item, self._function(item)
             return
-        waiting, again = deque(items), list[Item]()
-        while waiting or self._busy:
-            with _started_safely(threads_for(self._jobs)):
-                while waiting and len(self._busy) < self._jobs:
-                    self._give(waiting.popleft())
-            for future in wait(self._busy, return_when=FIRST_COMPLETED).done:
-                pool, item = self._busy.pop(future)
-                if not isinstance(future.exception(), BrokenProcessPool):
-                    self._idle.append(pool)
-                    yield item, future.result()
-                elif item in again:
-                    yield item, WorkerKilled("its process was killed twice, as happens where memory is short")
-                else:
-                    again.append(item)
-                    waiting.append(item)
-
-    @functools.cached_property
-    def _pickled(self) -> bytes:
-        return pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
-
-    def _give(self, item: Item) -> None:
-        """Let an idle process, or a new one, work on an item."""
-        if self._idle:
-            pool = self._idle.pop()
-        else:
-            pool = ProcessPoolExecutor(1, self._context, _begin, (self._ends, self._pickled))
         try:
-            self._busy[pool.submit(_call, item)] = pool, item
-        except BrokenProcessPool:  # it was killed while it had nothing to do
-            self._give(item)
+            with _started_safely(threads_for(self._jobs)):
+                futures = {self._pool.submit(_call, item): item for item in items}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise PointSplatError(
+                "a process was killed, as happens where memory is short; the same command resumes, with fewer --jobs "
+                "if need be"
+            ) from error
 
 
 def check_jobs(jobs: int) -> None:

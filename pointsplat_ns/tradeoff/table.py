@@ -14,7 +14,7 @@ from pointsplat_ns.compression.quality import decibels
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.io.outputs import claimed_folder
+from pointsplat_ns.io.outputs import need_folder
 from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
@@ -103,7 +103,8 @@ def measure_tradeoff(
     check_options(keep, by, repairs, within, views)
     path, folder = Path(scene), Path(folder)
     need_named_data(path, data)
-    with claimed_folder(folder), progress_bar(progress) as report:
+    need_folder(folder)
+    with progress_bar(progress) as report:
         if (folder / RESULTS["json"]).exists() and not force:
             raise SceneError(f"{folder / RESULTS['json']}: exists already; name another folder, or use --force")
         report("looking for views", 0.0)

@@ -14,8 +14,7 @@ from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.goals import GOALS
-from pointsplat_ns.compression import acceptance, pictures, quality, trained_refiner
-from pointsplat_ns.compression.requests import STEPS
+from pointsplat_ns.compression import pictures, quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.io.discovery import find_scenes
@@ -125,7 +124,7 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
         assert (shown["name"], shown["amount"]) == ("my-room", "150 Gaussians")
         assert f"{page}: {bytes_text(page.stat().st_size)}, to " in said
     assert ('<iframe src="my%20room_web.html" title="my-room"' in said) == (goal == "web")
-    assert [scene.name for scene in find_scenes(tmp_path)] == ["my room"]
+    assert [*find_scenes(tmp_path)] == ["my room"]
     run(
         "compact",
         "my room.ply",
@@ -169,34 +168,6 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
     assert "next: " not in capsys.readouterr().out
 
 
-def test_a_run_is_compared_from_the_poses_of_its_dataset_and_as_it_was_drawn(helps, trained_walls, tmp_path, capsys):
-    (source,) = (trained_walls / "wall-b" / "splatfacto-cpu").iterdir()
-    seen = []
-    dense_reference = acceptance.DenseReference
-
-    class Watched(dense_reference):
-        def __init__(self, dense, views):
-            seen.append((views.rasterize_mode, views.background.tolist(), views.width))
-            super().__init__(dense, views)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(acceptance, "DenseReference", Watched)
-        run("compact", source, "--refiner", helps, "-o", tmp_path / "small.ply", "--verbose")
-    assert "poses of the dataset" in capsys.readouterr().out
-    assert seen == [("antialiased", [1.0, 1.0, 1.0], 64)]
-    assert len(read_ply(tmp_path / "small.ply")) == round(len(read_scene(source)) / 2 + 0.1)
-
-
-def test_the_refiner_that_ships_is_used_if_it_is_asked_for(ply, tmp_path, capsys, monkeypatch):
-    (tmp_path / "empty").mkdir()
-    monkeypatch.setattr(trained_refiner, "SHIPPED_REFINER", tmp_path / "refiner.safetensors")
-    said = refusal(capsys, tmp_path / "empty" / "small.ply", ply, "--refiner", "shipped")
-    assert "--refiner RUN_OR_FILE" in said
-    weights(tmp_path / "refiner.safetensors", "scales", 0.15, keep=0.2)
-    run("compact", ply, "--refiner", "shipped", "-o", tmp_path / "small.ply")
-    assert len(read_ply(tmp_path / "small.ply")) == 30
-
-
 def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ply, helps, trained_walls, tmp_path, capsys, monkeypatch
 ):
@@ -224,22 +195,3 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ):
         assert wanted in refusal(capsys, output, scene, *options), options
     assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply)
-
-
-def test_a_scene_is_repaired_as_long_as_asked_and_what_it_brought_and_cost_is_said(
-    tmp_path, helps, capsys, monkeypatch
-):
-    """By an effort, of which the number of steps is known. The scene is so small that few views gain."""
-    monkeypatch.setitem(STEPS, "quick", 25)
-    monkeypatch.setattr(acceptance, "closer_in", lambda before, after: len(before.errors))
-    write_ply(room(400), tmp_path / "room.ply")
-    options = ("--refiner", helps, "--keep", "40", "--by", "merge", "--effort", "quick", "-o", tmp_path / "small.ply")
-    options += ("--verbose",)
-    run("compact", tmp_path / "room.ply", *options, "--picture", tmp_path / "shown.png")
-    said = " ".join(capsys.readouterr().out.split())
-    found = re.search(r"repaired by 25 steps in [\d.]+ s: ([\d.]+) -> ([\d.]+) dB PSNR against", said)
-    assert found is not None, said
-    assert float(found[2]) >= float(found[1]) + acceptance.ACCEPTANCE.min_gain
-    assert re.search(r"merged(, refined)? and repaired to 40 of 400", said)
-    assert "repaired, side by side" in said
-    assert len(read_ply(tmp_path / "small.ply")) == 40

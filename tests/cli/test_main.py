@@ -1,7 +1,6 @@
 """The command line: help, words that are read, errors."""
 
 import contextlib
-import io
 import os
 import re
 import shlex
@@ -13,7 +12,6 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from pointsplat_ns import cli
 from pointsplat_ns.cli import main
 from pointsplat_ns.cli.help import EXAMPLES
 
@@ -64,14 +62,6 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out == f"pointsplat-ns {ps.__version__}\n"
 
 
-def test_the_program_ends_at_once_with_all_that_was_registered_for_its_end_and_all_of_its_output():
-    code = (
-        "from pointsplat_ns.cli import program; import atexit; atexit.register(print, 'more'); program(); print('late')"
-    )
-    ended = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, f"pointsplat-ns {ps.__version__}\nmore\n", "")
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("where", ["full", "closed"])
 def test_output_that_nobody_can_take_ends_without_a_traceback(where):
@@ -92,17 +82,6 @@ def test_streams_that_are_closed_go_nowhere_and_no_file_gets_their_numbers(tmp_p
     script = "from pointsplat_ns.cli import main; main(['--version']); assert open('file', 'w').fileno() > 2"
     line = f"{shlex.quote(sys.executable)} -c {shlex.quote(script)} <&- >&- 2>&-"
     subprocess.run(["sh", "-c", line], cwd=tmp_path, check=True)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_characters_that_standard_output_lacks_are_replaced(encoding, monkeypatch):
-    output = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-    monkeypatch.setattr(sys, "stdout", output)
-    with pytest.raises(SystemExit) as end:
-        main(["--help"])
-    assert not end.value.code and output.errors == "strict" and sys.stdout is output
-    said = output.buffer.getvalue().decode(encoding)
-    assert "? prune" in said.replace(" " * 3, " ") and "exit status:" in said
 
 
 ORDERS = "\x1b]0;pwned\x07\x9b31m\x08\x1b[2J"
@@ -165,32 +144,6 @@ def test_a_command_line_that_is_not_understood_has_status_2(capsys):
         main(["prune", "room.ply", "--keeep", "10%"])
     said = capsys.readouterr()
     assert end.value.code == 2 and "--keeep" in said.err and said.out == ""
-
-
-@pytest.mark.parametrize(
-    ("words", "name", "value"),
-    [
-        ("view a.ply --port 8k", "port", 8000),
-        ("view a.ply --port 1,000", "port", 1000),
-        ("prune a.ply --memory 12kb", "memory", 0.012),
-    ],
-)
-def test_an_option_understands_a_number_as_people_write_it(words, name, value, monkeypatch):
-    called, real = {}, cli._command
-
-    def watched(command):
-        function = real(command)
-
-        def instead(**options):
-            called.update(options)
-
-        instead.__signature__, instead.__wrapped__ = __import__("inspect").signature(function), function
-        instead.__annotations__, instead.__doc__ = function.__annotations__, function.__doc__
-        return instead
-
-    monkeypatch.setattr(cli, "_command", watched)
-    main(words.split())
-    assert called[name] == value
 
 
 def test_what_is_no_number_is_refused_with_those_that_are(capsys):

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
-from lab.common.ways import SplatTransform
 from making import normal_scene
 
 REPOSITORY = Path(__file__).parents[2]
@@ -21,9 +20,7 @@ with open({log!r}, "a") as log:
 """
 
 COMMANDS = (
-    "prune scenes -o pruned --keep 4 --by paper --jobs 2",
     "compact scenes -o compacted --keep 4 --effort instant --jobs 2",
-    "convert scenes converted --to .spz --jobs 2",
     "prune scenes/1.ply -o merged.ply --keep 4",  # loads the kernels
 )
 """Commands that start processes."""
@@ -77,17 +74,6 @@ def test_a_matplotlibrc_of_the_current_folder_is_not_obeyed(planted):
     (planted / "matplotlibrc").write_text("figure.facecolor: red\nsavefig.facecolor: red\nlines.linewidth: 9\n")
     assert pointsplat(planted, words.format("after")).returncode == 0
     assert (planted / "before.png").read_bytes() == (planted / "after.png").read_bytes()
-
-
-def test_splat_transform_of_the_current_folder_is_not_run(planted, monkeypatch):
-    """npx would run it."""
-    npx = planted.parent / "bin" / "npx"
-    npx.parent.mkdir()
-    npx.write_text("#!/bin/sh\nshift\nexec ./node_modules/.bin/$*\n")
-    npx.chmod(0o755)
-    monkeypatch.setenv("PATH", str(npx.parent))
-    monkeypatch.chdir(planted)
-    assert SplatTransform().missing and not (planted.parent / "log").exists()
 
 
 def test_each_place_that_starts_processes_is_known():

@@ -47,6 +47,6 @@ def test_processes_that_share_a_scene_write_the_bytes_of_one_also_after_a_kill(t
 def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path):
     write_ply(normal_scene(50), tmp_path / "scene.ply")
     status, said = pruned(tmp_path, "--jobs", 2)
-    assert status == 1 and "scene.ply: one scene; --jobs is for a folder of scenes" in said
+    assert status == 1 and "scene.ply: fits into memory; --jobs is for a scene that is merged in parts" in said
     status, said = pruned(tmp_path, "--jobs", 0, "--memory", "10kB")
     assert status == 1 and "jobs is 0; expected 1 or more" in said

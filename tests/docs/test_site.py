@@ -94,7 +94,7 @@ TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "no such file; expected a scene": (lambda: Path("room.ply").unlink(), "info room.ply"),
     "truncated": (cut, "info room.ply"),
     "exists already": (lambda: Path("room_pruned.ply").touch(), "prune room.ply"),
-    "cannot write a ksplat": (room, "convert room.ply room.ksplat"),
+    "cannot write a RAD": (room, "convert room.ply room.rad"),
     "a folder without config.yml": (lambda: Path("rooms").mkdir(), "lod rooms"),
     "2D Gaussians": (flat, "info flat.ply"),
     "dropped 1 of 4": (odd, "convert room.ply other.ply"),

@@ -8,15 +8,15 @@ import tracemalloc
 import zipfile
 import zlib
 
-import numpy as np
 import pytest
 import zstandard
+from compressed_plys import encode_compressed_ply
+from foreign import encode_spz4
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import pointsplat_ns as ps
 from making import cloud
-from pointsplat_ns.io.formats.compressed_ply import encode_compressed_ply
 from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.splat import encode_splat
 from pointsplat_ns.io.formats.spz import encode_spz
@@ -24,49 +24,12 @@ from pointsplat_ns.io.formats.spz import encode_spz
 SEED = 5
 
 
-def ksplat(compression=1, degree=1, n=40, bucket=16):
-    """A ``.ksplat`` file of random bytes that make sense, in one section with two full buckets and one partly full."""
-    rng = np.random.default_rng(SEED)
-    full, rest = divmod(n, bucket)
-    k = 3 * ((degree + 1) ** 2 - 1)
-    head = bytearray(4096)
-    struct.pack_into("<BB2xIIIIH", head, 0, 0, 1, 1, 1, n, n, compression)
-    section = bytearray(1024)
-    buckets = full + 1 if compression else 0
-    stored = 12 if compression else 0
-    struct.pack_into(
-        "<IIIIfHxxIIIIH", section, 0, n, n, bucket, buckets, 5.0, stored, 32767 if compression else 0, 0,
-        full if compression else 0, 1 if compression else 0, degree,
-    )  # fmt: skip
-    number = ("<f4", "<f2", "<f2")[compression]
-    row = np.dtype(
-        [
-            ("means", ("<f4", "<u2", "<u2")[compression], 3),
-            ("stds", number, 3),
-            ("quats", number, 4),
-            ("rgba", "u1", 4),
-            ("sh", ("<f4", "<f2", "u1")[compression], (k,)),
-        ]
-    )
-    rows = np.zeros(n, row)
-    rows["means"] = rng.normal(size=(n, 3)) if compression == 0 else rng.integers(0, 65535, (n, 3))
-    rows["stds"], rows["quats"] = rng.uniform(0.01, 1, (n, 3)), rng.normal(size=(n, 4))
-    rows["rgba"] = rng.integers(0, 256, (n, 4))
-    rows["sh"] = rng.normal(size=(n, k)) if compression < 2 else rng.integers(0, 256, (n, k))
-    middle = b""
-    if compression:
-        centres = np.arange(3 * buckets, dtype="<f4")
-        middle = struct.pack("<I", rest) + centres.tobytes()
-    return bytes(head + section) + middle + rows.tobytes(), rows
-
-
 FILES = {
     ".compressed.ply": encode_compressed_ply(cloud(300, SEED, 1)),
     ".spz": encode_spz(cloud(300, SEED, 1)),
-    "4.spz": encode_spz(cloud(300, SEED, 1), version=4),
+    "4.spz": encode_spz4(cloud(300, SEED, 1)),
     ".sog": encode_sog(cloud(300, SEED, 1)),
     ".splat": encode_splat(cloud(300, SEED, 0)),
-    ".ksplat": ksplat()[0],
 }
 
 
@@ -82,8 +45,8 @@ def refused(path, *fragments):
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_that_is_cut_short_is_refused(tmp_path, name):
     path = tmp_path / f"a{name}"
-    for share in (0.0, 0.001, 0.3, 0.9, 0.999):
-        path.write_bytes(FILES[name][: int(share * len(FILES[name]) // 32 * 32 + 7 * (share > 0))])
+    for share in (0.0, 0.02, 0.3, 0.9, 0.999):
+        path.write_bytes(FILES[name][: max(int(share * len(FILES[name])) // 32 * 32 - 25, 0)])
         if name == ".splat" and share == 0:
             continue  # a file of no Gaussians
         refused(path)
@@ -107,27 +70,6 @@ def test_a_garbled_file_is_read_or_refused_in_one_line(tmp_path, name, data):
         assert bool(scene.usable().all())
 
 
-@pytest.mark.parametrize("compression", [0, 1, 2])
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_ksplat_is_decoded_as_its_fields_say(tmp_path, compression, degree):
-    data, rows = ksplat(compression, degree)
-    (tmp_path / "a.ksplat").write_bytes(data)
-    scene = ps.load(tmp_path / "a.ksplat")
-    assert len(scene) == 40 and scene.sh_degree == degree
-    expected = rows["means"].astype(np.float64)
-    if compression:
-        centres = np.repeat(np.arange(9.0).reshape(3, 3), [16, 16, 8], axis=0)
-        expected = (expected - 32767) * (2.5 / 32767) + centres
-    assert np.allclose(scene.means.numpy(), expected, atol=1e-5)
-    assert np.allclose(scene.stds.numpy(), rows["stds"].astype(np.float32), rtol=1e-5)
-    sh = rows["sh"].astype(np.float64) if compression < 2 else rows["sh"] / 255 * 3 - 1.5
-    for band, start in ((1, 0), (2, 9))[:degree]:
-        size, first = 2 * band + 1, band**2 - 1
-        for channel in range(3):
-            part = sh[:, start + channel * size : start + (channel + 1) * size]
-            assert np.allclose(scene.features_rest[:, first : first + size, channel].numpy(), part, atol=1e-6)
-
-
 def most_memory(path):
     """Bytes at the peak while a file is read or refused."""
     tracemalloc.start()
@@ -138,7 +80,7 @@ def most_memory(path):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("count", [10**7, 2**31 - 1, 2**32 - 1])
+@pytest.mark.parametrize("count", [10**7, 2**32 - 1])
 @pytest.mark.parametrize("name", [".spz", "4.spz"])
 def test_an_spz_that_declares_more_than_it_holds_takes_no_memory(tmp_path, name, count):
     path = tmp_path / "a.spz"
@@ -196,18 +138,13 @@ def image(width, height):
     [
         (dict(meta=lambda meta: meta.update(count=10**5)), "pixels"),
         (dict(meta=lambda meta: meta.update(count=10**8)), "compressed bytes can hold"),
-        (dict(meta=lambda meta: meta.update(count=-1)), "declares -1"),
         (dict(meta=lambda meta: meta.update(count="many")), "declares 'many'"),
-        (dict(meta=lambda meta: meta.update(version=9)), "version 9"),
         (dict(meta=lambda meta: meta["means"].update(files=["../../etc/passwd", "x"])), "beside meta.json"),
-        (dict(meta=lambda meta: meta["means"].update(mins=[0])), "1 numbers, expected 3"),
         (dict(meta=lambda meta: meta["scales"].update(codebook=[0.0] * 10**4)), "a codebook of 10000"),
-        (dict(meta=lambda meta: meta["shN"].update(bands=7)), "SH degree 7"),
         (dict(meta=lambda meta: meta["shN"].update(count=10**9)), "a palette of 1000000000"),
         (dict(meta=lambda meta: meta.pop("quats")), "lacks 'quats'"),
         (dict(meta=b"[" * 100_000), "damaged"),
         (dict(meta=bytes(5 << 20)), "meta.json has 5242880 bytes"),
-        (dict(quats=image(4, 4)), "quats.webp has 4 x 4 pixels"),
         (dict(quats=image(5000, 5000)), "quats.webp has 5000 x 5000 pixels"),
         (dict(shN_centroids=image(64, 64)), "shN_centroids.webp has 64 x 64 pixels"),
         (dict(quats=b"no image"), "not a WebP image"),
@@ -222,7 +159,6 @@ def test_a_sog_that_lies_is_refused_by_what_is_wrong(tmp_path, change, fragment)
     "old, new, fragment",
     [
         (b"element vertex 300", b"element vertex 300000000", "chunks for 300000000"),
-        (b"element chunk 2", b"element chunk 1", "1 chunks for 300"),
         (b"uint packed_rotation", b"float packed_rotation", "lacks the uint32 property 'packed_rotation'"),
         (b"element sh 300", b"element sh 200", "'sh' has 200 rows"),
         (b"element chunk 2", b"element other 2", "lacks the element 'chunk'"),
@@ -233,14 +169,6 @@ def test_a_compressed_ply_that_lies_is_refused_by_what_is_wrong(tmp_path, old, n
     assert old in FILES[".compressed.ply"]
     (tmp_path / "a.ply").write_bytes(FILES[".compressed.ply"].replace(old, new, 1))
     refused(tmp_path / "a.ply", fragment)
-
-
-def test_a_ksplat_that_declares_more_than_it_holds_takes_no_memory(tmp_path):
-    for at in (16, 4096, 4096 + 4, 4096 + 12, 4096 + 32, 4096 + 36):
-        data = bytearray(FILES[".ksplat"])
-        struct.pack_into("<I", data, at, 2**31)
-        (tmp_path / "a.ksplat").write_bytes(data)
-        assert most_memory(tmp_path / "a.ksplat") < 1e6
 
 
 @pytest.mark.parametrize("version", [3, 4])

@@ -2,23 +2,20 @@
 
 import dataclasses
 import functools
-import logging
 import math
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, cloud
-from pointsplat_ns.folders import convert_folder
+from making import cloud
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within_colours
 from pointsplat_ns.io.formats.spz_range import COLOURS, FARTHEST, SH, fraction_bits
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
-SPLATS = SHARED_DATA / "splats"
-WRITTEN = [kind for kind in FORMATS if kind.write is not None and kind.suffix != "meta.json"]
+WRITTEN = [kind for kind in FORMATS if kind.write is not None]
 
 
 @functools.cache
@@ -52,7 +49,7 @@ def loss_text(caplog):
     return found[0] if found else ""
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", ".glb"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_a_usual_room_is_written_without_a_warning(tmp_path, caplog, suffix):
     assert psnr_of_file(room(), tmp_path / f"a{suffix}") > 44
     assert not caplog.records
@@ -76,7 +73,7 @@ def test_spz_that_is_written_again_loses_no_position():
         assert torch.equal((read.means * 2**again).round() / 2**again, read.means)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("unit", [1e-3, 1e-5])
 def test_spz_names_sizes_that_it_cuts_and_the_format_that_keeps_them(tmp_path, caplog, unit):
     small = in_units(room(), unit)
     psnr_of_file(small, tmp_path / "a.spz", unit)
@@ -108,14 +105,6 @@ def test_spz_brings_a_handful_of_far_gaussians_in_and_counts_them(tmp_path, capl
     assert torch.allclose(angle(back), angle(scene), rtol=1 / 30)  # half a step of log-scales
 
 
-def test_spz_leaves_far_gaussians_where_their_distance_costs_nothing(tmp_path, caplog):
-    scene = in_units(with_floaters(room()), 1 / 64)  # sizes grow again: blobs of 0.03 units, floaters at 800
-    scene = scene.replace(scales=scene.scales + math.log(64.0))
-    ps.save(scene, tmp_path / "a.spz")
-    assert not loss_text(caplog)
-    assert float((ps.load(tmp_path / "a.spz").means - scene.means).abs().max()) <= 2.0**-13
-
-
 def test_spz_names_coarse_positions_where_many_gaussians_are_far(tmp_path, caplog):
     scene = room()
     scene = scene.replace(means=torch.where(torch.arange(len(scene))[:, None] % 2 == 0, 1e5, scene.means))
@@ -138,9 +127,8 @@ def with_dark(scene, lobes):
     return scene.replace(features_dc=dc, features_rest=rest)
 
 
-@pytest.mark.parametrize(("suffix", "least"), [(".spz", 44), (".compressed.ply", 42)])
-def test_colours_far_below_black_stay_black(tmp_path, caplog, suffix, least):
-    assert psnr_of_file(with_dark(room(), lobes=False), tmp_path / f"a{suffix}") > least
+def test_colours_far_below_black_stay_black(tmp_path, caplog):
+    assert psnr_of_file(with_dark(room(), lobes=False), tmp_path / "a.spz") > 44
     assert not loss_text(caplog)
 
 
@@ -154,16 +142,6 @@ def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog
     with torch.no_grad():
         cut_apart = float(ps.psnr(ps.render(cut, views()), ps.render(scene, views())).mean())
     assert after > cut_apart + 6  # 12 dB in a whole room
-
-
-def test_compressed_ply_names_colours_that_widen_their_chunks(tmp_path, caplog):
-    psnr_of_file(with_dark(room(), lobes=True), tmp_path / "a.compressed.ply")
-    assert "of the colours are rounded to 0.02" in loss_text(caplog)
-
-
-def test_compressed_ply_names_positions_that_share_a_chunk_with_far_ones(tmp_path, caplog):
-    psnr_of_file(with_floaters(room()), tmp_path / "a.compressed.ply")
-    assert "of the Gaussians are rounded by more than their size" in loss_text(caplog)
 
 
 def test_a_splat_names_sh_and_antialiasing_that_it_does_not_hold(tmp_path, caplog):
@@ -192,9 +170,17 @@ def test_black_from_everywhere_rises_and_its_sh_stay():
     assert float(seen_colours(fitted.features_dc, fitted.features_rest.transpose(1, 2)).max()) == 0.0
 
 
-@pytest.mark.parametrize(("degree", "n"), [(0, 2), (0, 600), (1, 257), (2, 600), (3, 1), (3, 500)])
+STEPS = {  # of sizes, constant and other SH coefficients, opacities and rotations; None: 256 numbers of their own
+    ".ply": (0.0, 0.0, 0.0, 0.0, 0.0),
+    ".spz": (1 / 16, 1 / (255 * 0.15), 8 / 128, 1 / 255, 0.5**0.5 / 511),  # written with 5 bits of SH
+    ".sog": (None, None, None, 1 / 255, 2**0.5 / 255),
+    ".splat": (0.0, 1 / (255 * SH_C0), 0.0, 1 / 255, 1 / 128),
+}
+
+
+@pytest.mark.parametrize(("degree", "n"), [(0, 2), (1, 257), (2, 600), (3, 1)])
 @pytest.mark.parametrize("kind", WRITTEN, ids=lambda kind: kind.suffix)
-def test_numbers_in_the_declared_range_come_back_within_half_a_step(tmp_path, kind, degree, n):
+def test_numbers_in_range_come_back_within_half_a_step(tmp_path, kind, degree, n):
     holds, k = kind.capacity, (degree + 1) ** 2 - 1
     generator = torch.Generator().manual_seed(1)
 
@@ -214,42 +200,19 @@ def test_numbers_in_the_declared_range_come_back_within_half_a_step(tmp_path, ki
     )
     ps.save(scene, tmp_path / f"a{kind.suffix}")
     before, after = scene if kind.order is None else scene[kind.order(scene)], ps.load(tmp_path / f"a{kind.suffix}")
-
-    def within(span, one, other, wider=1.0):
-        exact = 3e-6 * max(1.0, float(one.abs().max()))
-        # Where numbers depend on the scene: 256 of its own, or the 256 or more between its bounds.
-        step = float(one.max() - one.min()) / 128 if span.how else wider * span.step
-        assert float((one - other).abs().max()) <= step / 2 + exact
-
     assert after.sh_degree == (0 if holds.sh is None else degree)
-    within(holds.sizes, before.scales, after.scales)
-    within(holds.colours, before.features_dc, after.features_dc)
-    if holds.sh and k and (n < 500 or not holds.sh.how):  # more have fewer entries of a palette than rows
-        # SPZ is written with 6 and 5 bits, and reads 8. The ends of the compressed PLY's are half a step longer.
-        wider = {".spz": 8.0, ".compressed.ply": 2.0}.get(kind.suffix, 1.0)
-        within(holds.sh, before.features_rest, after.features_rest, wider)
-    within(holds.opacities, before.alphas, after.alphas)
-    unit = torch.nn.functional.normalize(after.quats, dim=1)
-    unit = unit * (unit * before.quats).sum(dim=1, keepdim=True).sign()
-    # The largest component follows from the others, each off by half a step.
-    within(holds.rotations, before.quats, unit, 4.0)
+    turns = torch.nn.functional.normalize(after.quats, dim=1)
+    turns = turns * (turns * before.quats).sum(dim=1, keepdim=True).sign()
+    pairs = [
+        (before.scales, after.scales), (before.features_dc, after.features_dc),
+        (before.features_rest, after.features_rest), (before.alphas, after.alphas), (before.quats, turns),
+    ]  # fmt: skip
+    for index, ((one, other), step) in enumerate(zip(pairs, STEPS[kind.suffix], strict=True)):
+        if not other.numel() or (index == 2 and step is None and n > 500):  # a palette has fewer entries than rows
+            continue
+        wide = float(one.max() - one.min()) / 128 if step is None else step
+        # The largest component of a rotation follows from the others, each off by half a step.
+        most = 0.5 * wide * (4 if index == 4 else 1) + 3e-6 * max(1.0, float(one.abs().max()))
+        assert float((one - other).abs().max()) <= most, index
     steps = 0 if holds.position_steps is None else holds.position_steps(before)[:, None]
     assert bool(((before.means - after.means).abs() <= 0.51 * steps + 1e-6).all())
-
-
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="the files are not there")
-def test_splats_that_others_published_fit_into_every_format():
-    names = [folder for folder in sorted(SPLATS.iterdir()) if folder.is_dir() and folder.name != "__pycache__"]
-    for folder in names:
-        files = [path for path in folder.iterdir() if path.suffix in (".ply", ".spz", ".sog")]
-        scene = ps.load(files[0] if files else folder).replace(antialiased=False)
-        for kind in WRITTEN:
-            if kind.suffix != ".splat" or not scene.sh_degree:
-                assert losses(scene, kind.capacity) == [], (folder.name, kind.suffix)
-
-
-def test_a_folder_of_scenes_names_results_that_lose_something(tmp_path, caplog):
-    ps.save(in_units(cloud(30), 1e-3), tmp_path / "in" / "a.ply")
-    with caplog.at_level(logging.WARNING):
-        convert_folder(tmp_path / "in", tmp_path / "out", suffix=".spz")
-    assert loss_text(caplog).startswith(str(tmp_path / "out" / "a.spz"))

@@ -1,4 +1,4 @@
-"""Writers that are killed at every operation on files, write the same file at once, or find the disk full."""
+"""Writers that are killed at every operation on files, or find the disk full."""
 
 import os
 import shutil
@@ -25,15 +25,14 @@ from pointsplat_ns.levels.folder import write_levels
 from pointsplat_ns.io.files import write_json
 
 base = here = Path(sys.argv[1])
-new, other = (ps.load(base / name) for name in ("new.ply", "other.ply"))
+new = ps.load(base / "new.ply")
 
 def levels(scene, out):
     write_levels(out / "lod", [scene] * 2, {}, [{}, {}], force=True)
 
 WRITERS = {
     "ply": lambda scene, out: ps.save(scene, out / "a.ply", overwrite=True),
-    "spz": lambda scene, out: ps.save(scene, out / "a.spz", overwrite=True),
-    "sog": lambda scene, out: ps.save(scene, out / "meta.json", overwrite=True),
+    "sog": lambda scene, out: ps.save(scene, out / "a.sog", overwrite=True),
     "json": lambda scene, out: write_json([len(scene)] * 300, out / "a.json"),
     "levels": levels,
 }
@@ -73,13 +72,6 @@ def at_every_operation(write):
         assert status in (0, -signal.SIGKILL), status
         shutil.copytree(here / "out", here / f"after-{count}")
 
-def at_once(write):
-    def often(scene):
-        for _ in range(12):
-            write(scene, here / "out")
-    pids = [child(lambda: often(new)), child(lambda: often(other))]
-    (here / "said.txt").write_text(str([ended(pid) for pid in pids]))
-
 def full(write):
     def limited():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -93,11 +85,11 @@ def full(write):
 
 for here in sorted(base.glob("*/*/")):
     shutil.copytree(here / "before", here / "out")
-    {"killed": at_every_operation, "at once": at_once, "full": full}[here.parent.name](WRITERS[here.name])
+    {"killed": at_every_operation, "full": full}[here.parent.name](WRITERS[here.name])
 """
 """Does the work of all tests here: forks children of one process that has imported everything, which takes seconds."""
 
-KINDS = {"killed": ("ply", "sog", "json", "levels"), "at once": ("ply", "json"), "full": ("ply", "spz", "sog", "json")}
+KINDS = {"killed": ("ply", "json", "levels"), "full": ("ply", "sog")}
 
 
 @pytest.fixture(scope="module")
@@ -105,12 +97,10 @@ def work(tmp_path_factory) -> Path:
     """A folder with one of each kind for each test, ``before`` and ``out`` in it, and what was ``said``."""
     base = tmp_path_factory.mktemp("work")
     ps.save(cloud(50, 1, 0), base / "new.ply")
-    ps.save(cloud(40, 2, 0), base / "other.ply")
     for what, kinds in KINDS.items():
         for kind in kinds:
             (base / what / kind / "before").mkdir(parents=True)
-            if what != "at once":
-                write_old(kind, base / what / kind / "before")
+            write_old(kind, base / what / kind / "before")
     alone = {**os.environ, "OMP_NUM_THREADS": "1"}  # what is forked has one thread
     command = [sys.executable, "-c", WORK, str(base)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=alone)
@@ -131,7 +121,7 @@ def write_old(kind: str, out: Path) -> None:
     elif kind == "levels":
         write_levels(out / "lod", [old], {}, [{}])
     else:
-        ps.save(old, out / {"ply": "a.ply", "spz": "a.spz", "sog": "meta.json"}[kind])
+        ps.save(old, out / f"a.{kind}")
 
 
 @pytest.mark.parametrize("kind", KINDS["killed"])
@@ -145,9 +135,8 @@ def test_a_killed_writer_leaves_the_old_file_or_the_new_one(kind, work):
     for kill in kills[:-1]:
         left = shown(kill)
         unfinished += any(path.name.endswith(".part") for path in kill.rglob(".*"))
-        whole = {"sog": "meta.json", "levels": "lod/lod.json"}.get(kind)
-        if whole:  # its parts belong together: this file is there only with all of them
-            assert whole not in left or left in (before, after), kill.name
+        if kind == "levels":  # its parts belong together: this file is there only with all of them
+            assert "lod/lod.json" not in left or left in (before, after), kill.name
         else:
             assert all(data in (before.get(name), after.get(name)) for name, data in left.items()), kill.name
     assert unfinished > 1

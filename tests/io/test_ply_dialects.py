@@ -1,4 +1,4 @@
-"""PLYs of 3DGS as CloudCompare, ns-export and Mip-Splatting write them."""
+"""PLYs of 3DGS as CloudCompare and Mip-Splatting write them."""
 
 import math
 
@@ -9,7 +9,6 @@ from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import normal_scene, same_bits
-from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.ply_dialects import fuse_filter
@@ -25,43 +24,13 @@ def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefi
     path = write_columns(tmp_path / "a.ply", {**columns, **colors, "scalar_Original_cloud_index": columns["x"]}, text)
     assert same_bits(ps.load(path), scene)
     assert "not read: the vertex properties red, green, blue, scalar_Original_cloud_index" in caplog.text
-    assert [found.path for found in find_scenes(tmp_path)] == [path]
+    assert [*find_scenes(tmp_path).values()] == [path]
 
 
 def test_a_name_that_is_there_with_and_without_a_prefix_is_read_without(tmp_path):
     scene = normal_scene(4, 0)
     columns = {"scalar_opacity": np.zeros(4, np.float32), **columns_of(scene), "scal_rot_0": np.zeros(4, np.float32)}
     assert same_bits(ps.load(write_columns(tmp_path / "a.ply", columns)), scene)
-
-
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
-@pytest.mark.parametrize("text", [False, True])
-def test_colours_as_red_green_and_blue_are_read(tmp_path, kind, text):
-    """As ``ns-export gaussian-splat --ply-color-mode rgb`` writes them, between normals and opacity."""
-    scene = normal_scene(5, 0)
-    top = np.iinfo(kind).max if np.dtype(kind).kind == "u" else 1
-    shares = np.linspace(0, 1, 15).reshape(5, 3)
-    colors = dict(zip(("red", "green", "blue"), (shares * top).astype(kind).T, strict=True))
-    columns = {name: array for name, array in columns_of(scene).items() if not name.startswith("f_dc")}
-    path = write_columns(tmp_path / "a.ply", {**columns, **colors}, text, comments=["Vertical Axis: z"])
-    found = ps.load(path)
-    stored = np.stack([*colors.values()], axis=1).astype(np.float64) / top
-    assert np.allclose(0.5 + SH_C0 * found.features_dc.double().numpy(), stored, rtol=0, atol=1e-6)
-    assert same_bits(found.replace(features_dc=scene.features_dc), scene) and found.up == "z"
-
-
-def test_colours_as_floats_beyond_1_are_said(tmp_path, caplog):
-    columns = {name: array for name, array in columns_of(normal_scene(3, 0)).items() if not name.startswith("f_dc")}
-    colors = {name: np.array([0, 128, 255], np.float32) for name in ("red", "green", "blue")}
-    ps.load(write_columns(tmp_path / "a.ply", {**columns, **colors}))
-    assert "'red', 'green' and 'blue' are float32 up to 255, read as shares of 1" in caplog.text
-
-
-def test_points_with_colours_are_no_gaussians(tmp_path):
-    columns = {name: np.zeros(3, np.float32) for name in "xyz"}
-    columns |= {name: np.zeros(3, np.uint8) for name in ("red", "green", "blue")}
-    with pytest.raises(ps.SceneError, match="lacks the vertex property 'opacity'"):
-        ps.load(write_columns(tmp_path / "a.ply", columns))
 
 
 def test_the_3d_filter_of_mip_splatting_is_fused_as_its_exporter_does(tmp_path, caplog):
@@ -115,11 +84,3 @@ def test_a_3d_filter_on_values_that_are_no_numbers_gives_none():
     assert wide[0].tolist() == [-inf, 0, 0] and found[0] == 1  # a flat axis stays flat without a filter
     assert wide[1, 0] == 0 and found[1] == -inf  # nothing of it is left
     assert found[2] == inf and found[3] == -inf and np.isnan(wide[4]).all()
-
-
-def test_a_3d_filter_of_2d_gaussians_leaves_them_flat(tmp_path):
-    scene = normal_scene(4, 0)
-    columns = {name: array for name, array in columns_of(scene).items() if name != "scale_2"}
-    found = ps.load(write_columns(tmp_path / "a.ply", {**columns, "filter_3D": np.full(4, 0.5, np.float32)}))
-    assert bool((found.scales[:, 2] == -87).all()) and bool((found.opacities > -20).all())
-    assert bool((found.scales[:, :2] > scene.scales[:, :2]).all())

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import pytest
 import torch
+from compressed_plys import encode_compressed_ply
+from foreign import encode_spz4
 
 import pointsplat_ns as ps
 from making import ball, cloud, run_of, same_bits, small_refiner
 from pointsplat_ns.gaussians import Traits
-from pointsplat_ns.geometry.transforms import AXES, direction_of
-from pointsplat_ns.io.formats import format_to_write
-from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.io.turning import turned
-from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.pages.camera_path import FilmSettings, camera_path
-from pointsplat_ns.pages.flight import FlightFrame
-from pointsplat_ns.pruning import Megabytes
+from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.rasterizer.scene import pixels_of
 
 AXIS = "-x"
@@ -62,44 +54,31 @@ def trained_so(scene):
 )
 def test_the_last_comment_of_a_ply_that_names_a_trait_counts(tmp_path, suffix, comments, traits, caplog):
     path = tmp_path / f"a{suffix}"
-    ps.save(cloud(3), path)
+    ps.save(cloud(3), path) if suffix == ".ply" else path.write_bytes(encode_compressed_ply(cloud(3)))
     assert ps.load(path).traits == Traits()
     lines = "".join(f"comment {comment}\n" for comment in comments).encode("latin-1")
     path.write_bytes(path.read_bytes().replace(b" 1.0\n", b" 1.0\n" + lines, 1))
     read = ps.load(path)
     assert read.traits == traits and ("drawn here as ordinary" in caplog.text) == ("SplatRenderMode: 2dgs" in comments)
-    ps.save(read, tmp_path / f"b{suffix}")
-    assert ps.load(tmp_path / f"b{suffix}").traits == traits
+    ps.save(read, tmp_path / "b.ply")
+    assert ps.load(tmp_path / "b.ply").traits == traits
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", "meta.json"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
     for scene in (cloud(20), trained_so(cloud(20))):
         ps.save(scene, named(tmp_path, suffix), overwrite=True)
         back = ps.load(named(tmp_path, suffix))
         assert back.antialiased is scene.antialiased and len(back) == 20
-    (tmp_path / "4.spz").write_bytes(encode_spz(trained_so(cloud(20)), version=4))
+    (tmp_path / "4.spz").write_bytes(encode_spz4(trained_so(cloud(20))))
     assert ps.load(tmp_path / "4.spz").antialiased
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".glb"])
-def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, suffix, caplog):
-    ps.save(cloud(3, sh_degree=0), tmp_path / f"a{suffix}")
+def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, caplog):
+    ps.save(cloud(3, sh_degree=0), tmp_path / "a.splat")
     assert not caplog.text
-    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / f"a{suffix}", overwrite=True)
+    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / "a.splat", overwrite=True)
     assert "the mark of antialiased training; .sog keeps it" in caplog.text
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".glb"])
-@pytest.mark.parametrize(("traits", "comment"), [(Traits(True), 29), (Traits(up="z"), 25), (Traits(True, "-y"), 55)])
-def test_the_size_of_a_file_is_known_to_the_byte_and_a_budget_holds(tmp_path, suffix, traits, comment):
-    path, scene = tmp_path / f"a{suffix}", cloud(600).replace(antialiased=traits.antialiased, up=traits.up)
-    size = format_to_write(path).bytes_of
-    ps.save(scene[:400], path)
-    exact = size(400, 1, traits)
-    assert path.stat().st_size == exact == size(400, 1, Traits()) + (comment if "ply" in suffix else 0)
-    assert len(ps.prune(scene, Megabytes(exact / 1e6, suffix), by="coverage")) == 400
-    assert len(ps.prune(scene, Megabytes((exact - 1) / 1e6, suffix), by="coverage")) < 400
 
 
 def test_traits_stay_on_every_way_through_the_package():
@@ -154,8 +133,7 @@ def test_other_axes_are_refused():
             cloud(3).replace(up=up)
 
 
-@pytest.mark.parametrize("old", AXES)
-@pytest.mark.parametrize("new", AXES)
+@pytest.mark.parametrize(("old", "new"), [("x", "-x"), ("z", "y"), ("-y", "z"), ("-z", "-z")])
 def test_the_axis_turns_with_the_scene(old, new, tmp_path):
     scene = cloud(20).replace(up=old)
     placed = ps.place(scene, up=new, scale=3.0)
@@ -164,35 +142,3 @@ def test_the_axis_turns_with_the_scene(old, new, tmp_path):
     torch.testing.assert_close(placed.means.double() @ direction_of(new), 3 * height, rtol=0, atol=1e-5)
     ps.save(placed, tmp_path / "turned.ply")
     assert ps.load(tmp_path / "turned.ply").up == new
-
-
-def test_an_axis_that_is_none_after_a_turn_is_not_declared():
-    tilt = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6], [0.0, 0.6, 0.8]], dtype=torch.float64)
-    assert [turned(cloud(5).replace(up=up), tilt).up for up in ("x", "z", None)] == ["x", None, None]
-
-
-def test_a_declared_axis_counts_as_a_named_one_wherever_up_counts(tmp_path, room):
-    declared, up = room.replace(up=AXIS), Up(direction_of(AXIS))
-    ps.save(declared, tmp_path / "room.ply")
-    said = ps.info(tmp_path / "room.ply", resolution="64x48")
-    assert said.up == up.direction.tolist() and not said.up_is_guess
-    views = ps.sample_views(declared, 3, 64, 48)
-    assert torch.equal(views.viewmats, ps.sample_views(room, 3, 64, 48, up=up.direction).viewmats)
-    small = ps.prune(declared, 0.2)
-    assert same_bits(small, ps.prune(room, 0.2, up=AXIS)) and not same_bits(small, ps.prune(room, 0.2))
-    film = FilmSettings(64, 48, seconds=0.2)
-    for known in (None, ps.sample_views(room, 8, 64, 48)):
-        frame, named = FlightFrame.of(declared, known), FlightFrame.of(room, known, up)
-        assert str(frame.up) == AXIS and torch.equal(frame.views.viewmats, named.views.viewmats)
-    path, wanted = (
-        camera_path(scene, ViewSource(scene), None, film, up=axis) for scene, axis in ((declared, None), (room, up))
-    )
-    assert torch.equal(path.views.viewmats, wanted.views.viewmats)
-    page = ps.write_page(declared, tmp_path / "room.html")
-    assert json.dumps({"up": up.direction.tolist()})[1:-1].replace(" ", "") in page.read_text().replace(" ", "")
-
-
-def test_another_named_axis_counts_more(room):
-    declared = room.replace(up=AXIS)
-    assert str(Sampler(declared, up=Up(direction_of("z"))).up) == "z"
-    assert same_bits(ps.prune(declared, 0.2, up="y"), ps.prune(room, 0.2, up="y"))

@@ -109,7 +109,7 @@ def test_scenes_that_are_not_there_are_refused(changes, viewer):
     assert said(viewer, "/scene", **{**asked, "stage": 2})[0] == 409
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".sog"])
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
 def test_a_dropped_scene_of_any_format_is_shown(suffix, empty, tmp_path):
     assert b"Drop a file here" in answer(empty, "GET", "/")[1]
     ps.save(ball(300), tmp_path / f"a{suffix}")

@@ -69,28 +69,3 @@ def test_what_is_shared_is_declared_with_its_types():
     assert functions["pointsplat_size"] == (ctypes.c_int, [])
     result, (task, rows, count) = functions["pointsplat_run"]
     assert result is None and task.dtype is None and rows.dtype == torch.int64 and count is ctypes.c_int64
-
-
-def test_tensors_are_passed_by_address_and_kept_alive():
-    given = torch.arange(3.0)
-    structs = structs_of(SHARED)
-    task = structs["Task"](a=given, count=3, inner=structs["Inner"](number=1))
-    assert task.inner.number == 1 and task.a == given.data_ptr() and task.b is None and task.kept["a"] is given
-    task.fill(b=task.a + 4)
-    assert task.b == given.data_ptr() + 4
-
-
-@pytest.mark.parametrize(
-    ("values", "error"),
-    [
-        ({"c": 1}, AttributeError),
-        ({"count": torch.zeros(1)}, TypeError),
-        ({"a": torch.zeros(3, dtype=torch.float64)}, TypeError),
-        ({"a": torch.zeros(3, 3).T}, TypeError),
-        ({"a": torch.zeros(3, device="meta")}, TypeError),
-    ],
-    ids=["no such field", "no pointer", "dtype", "strides", "device"],
-)
-def test_a_value_that_does_not_fit_a_struct_is_an_error(values, error):
-    with pytest.raises(error):
-        structs_of(SHARED)["Task"](**values)

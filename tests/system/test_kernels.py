@@ -2,8 +2,6 @@
 
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -41,63 +39,6 @@ def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeyp
     with ThreadPoolExecutor(1) as other, pytest.raises(SystemExit):
         other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
     assert called == [threading.get_ident()]
-
-
-def test_where_the_system_starts_no_more_threads_one_does_all(monkeypatch):
-    class Full(ThreadPoolExecutor):
-        def submit(self, *args):
-            raise RuntimeError("can't start new thread")
-
-    called = []
-    monkeypatch.setattr(kernels, "_pool", lambda process: Full(1))
-    with ThreadPoolExecutor(1) as other:
-        other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
-    kernels.on_threads(True, lambda _: called.append(None), threads=3)
-    assert len(called) == 2
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-def test_a_process_that_was_forked_has_threads_of_its_own():
-    code = """
-import os, sys
-from pointsplat_ns.system import kernels
-kernels._pool(os.getpid()).submit(int).result()
-child = os.fork()
-if child == 0:
-    os._exit(kernels._pool(os.getpid()).submit(int, 7).result(10))
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 7)
-"""
-    root = Path(kernels.__file__).parents[2]
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=root, timeout=120, check=True)
-
-
-PROGRAM = """
-import resource, sys
-import torch
-from pointsplat_ns.system.memory import keep_freed_memory
-kept = sys.argv[1] == "keep" and keep_freed_memory()
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    torch.ones(10_000_000) + 1  # two blocks of 40 MB, more than glibc ever keeps by itself
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-# The first rounds break up the memory that there is; later ones find their places.
-print(kept, min(faults() for _ in range(6)))
-"""
-
-
-def run(word: str) -> tuple[bool, int]:
-    out = subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
-    kept, faults = out.split()
-    return kept == "True", int(faults)
-
-
-def test_large_tensors_cost_new_pages_once():
-    kept, after = run("keep")
-    if not kept:
-        pytest.skip("not Linux with glibc, where there is nothing to do")
-    before = run("leave")[1]
-    # 80 MB are 19,500 pages of 4 kB; larger pages make fewer.
-    assert after < 0.1 * before
 
 
 @pytest.mark.parametrize("variable", [None, "7"])

@@ -6,10 +6,10 @@ import psutil
 import pytest
 import torch
 
-from pointsplat_ns.errors import DataError
+from killing import where
+from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.system.cores import cores
 from pointsplat_ns.system.workers import Workers, check_jobs
-from scene_work import where
 
 
 def test_processes_share_the_cores_pass_errors_on_and_end_with_the_context(monkeypatch):
@@ -23,6 +23,11 @@ def test_processes_share_the_cores_pass_errors_on_and_end_with_the_context(monke
     assert torch.get_num_threads() == before and "OMP_NUM_THREADS" not in os.environ
     assert os.getpid() not in {pid for pid, _ in found.values()}
     assert not any(psutil.pid_exists(pid) for pid, _ in found.values())
+
+
+def test_a_process_that_is_killed_ends_the_work_with_one_error():
+    with Workers(where, 2) as workers, pytest.raises(PointSplatError, match="a process was killed, as happens where"):
+        list(workers.results([1.0, -0.1]))  # noticed at the latest when another process has a result
 
 
 def test_one_job_is_done_in_this_process_and_none_is_refused():

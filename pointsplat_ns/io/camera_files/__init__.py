@@ -22,16 +22,13 @@ from pointsplat_ns.io.camera_files.cameras import (
     rigid,
 )
 from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
-from pointsplat_ns.io.camera_files.json_cameras import exported_cameras, inria_cameras, nerfstudio_cameras
+from pointsplat_ns.io.camera_files.json_cameras import inria_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
 from pointsplat_ns.io.runs import RUN_FILES, read_transforms
 from pointsplat_ns.views import Views
 
-CAMERA_KINDS = (
-    "cameras.json of 3DGS, transforms.json of nerfstudio, transforms_train.json of ns-export cameras, or the folder of "
-    "a COLMAP model or project"
-)
+CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model or project"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +80,7 @@ def camera_files_near(scene: Path) -> list[Path]:
     folder = scene.absolute().parent
     roots = [folder.parents[1]] if folder.parent.name == "point_cloud" else []
     files = [root / "cameras.json" for root in (*roots, folder)]
-    files += [folder / name for name in ("transforms_train.json", "transforms.json")]
+    files.append(folder / "transforms.json")
     return [*filter(Path.is_file, files), *(place for place in (folder, folder.parent) if model_folder(place))]
 
 
@@ -101,11 +98,10 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
     see the same field of view, by other focal lengths.
 
     Args:
-        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, the ``transforms_train.json`` of ``ns-export
-            cameras``, or the folder of a COLMAP model or project.
+        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, or the folder of a COLMAP model or project.
         transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of
             ``transforms.json`` and of COLMAP into the frame of the scene. By default the one beside ``path``, if there
-            is one. Poses of the others are in the scene's frame already.
+            is one. Poses of ``cameras.json`` are in the scene's frame already.
 
     Returns:
         C views, float64 on the CPU, over black, in the order of the names of their photos.
@@ -150,7 +146,7 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
 
 
 def _json_cameras(path: Path) -> CameraFile:
-    """The cameras of a JSON file: a list is INRIA's or of ns-export, an object with frames nerfstudio's."""
+    """The cameras of a JSON file: a list is INRIA's, an object with frames nerfstudio's."""
     if path.is_dir():
         raise DataError(
             f"{path}: a folder without cameras.bin or cameras.txt, there or in sparse/0; expected {CAMERA_KINDS}"
@@ -167,8 +163,7 @@ def _json_cameras(path: Path) -> CameraFile:
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({one_line(error, 80)}); expected {CAMERA_KINDS}") from error
     if isinstance(content, list):
-        exported = bool(content) and isinstance(content[0], dict) and "transform" in content[0]
-        return exported_cameras(content, path) if exported else inria_cameras(content, path)
+        return inria_cameras(content, path)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)
     if isinstance(content, dict) and "camera_path" in content:

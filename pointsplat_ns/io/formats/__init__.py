@@ -15,14 +15,12 @@ from pointsplat_ns.io.formats.registry import (
     format_to_write,
 )
 from pointsplat_ns.io.formats.sog_images import META as SOG_META
-from pointsplat_ns.io.formats.sog_images import PARTS as SOG_PARTS
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, coarser_levels
 
 __all__ = [
     "FORMATS",
     "READABLE",
     "SOG_META",
-    "SOG_PARTS",
     "STREAM_META",
     "WRITABLE",
     "Format",

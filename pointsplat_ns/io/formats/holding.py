@@ -1,7 +1,7 @@
 """What a format can hold of each attribute, and what a scene loses in it.
 
-Each format declares its range and its step of every attribute (:class:`Holds`). Before a scene is written,
-:func:`losses` compares the two. Small losses that a format has by design, such as its steps of sizes, count as none.
+Each format declares its ranges (:class:`Holds`). Before a scene is written, :func:`losses` compares it with them. Small
+losses that a format has by design, such as its steps of sizes, count as none.
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ class Span:
     low: float = -math.inf
     high: float = math.inf
     step: float = 0.0
-    """Between neighbouring numbers; 0 for those of float32, or where ``how`` says it."""
-    how: str = ""
-    """Numbers that depend on the scene, in words."""
+    """Between neighbouring numbers; 0 for those of float32, or where they depend on the scene."""
 
     def holds(self, values: Tensor) -> Tensor:
         """Whether values are in the range, up to half a step."""
@@ -44,30 +42,20 @@ class Span:
 
 FLOAT = Span()
 """Numbers of float32."""
-FLOAT_SIZES = Span(math.log(torch.finfo(torch.float32).tiny), math.log(torch.finfo(torch.float32).max))
-"""Log-scales of sizes in float32, without logarithms."""
 
 
 @dataclass(frozen=True)
 class Holds:
     """What a format can hold."""
 
-    positions: Span = FLOAT
-    """Scene units."""
     sizes: Span = FLOAT
     """Natural logarithms of standard deviations in scene units."""
     colours: Span = FLOAT
     """Constant SH coefficients."""
-    opacities: Span = FLOAT
-    """From 0 to 1."""
-    rotations: Span = FLOAT
-    """Components of quaternions of length 1."""
     sh: Span | None = FLOAT
     """The other SH coefficients; None if there are none."""
     position_steps: Callable[[Gaussians], Tensor] | None = None
     """Steps (N,) of the positions of a scene; None where a float32 scene loses nothing."""
-    colour_steps: Callable[[Gaussians], Tensor] | None = None
-    """Steps (N,) of the constant SH coefficients of a scene, where they depend on it."""
     antialiased: bool = True
     """Whether files say that a scene was trained with antialiasing."""
     offset: bool = False
@@ -112,11 +100,6 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
             f"{_percent(share)} of the Gaussians have colours outside of its range, by {float(error.max()):.2g} of "
             "white at most"
         )
-    if holds.colour_steps is not None:
-        steps = SH_C0 * holds.colour_steps(fitted)
-        share = _share(steps > 0.02, scene)
-        if share > _REPORTED:
-            found.append(f"{_percent(share)} of the colours are rounded to {float(steps.max()):.2g} of white at most")
     return found
 
 

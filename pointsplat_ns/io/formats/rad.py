@@ -18,20 +18,10 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.coding import Array, shares_of_dc, to_bytes, unit_quats
-from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.offsets import offset_text
 from pointsplat_ns.system.progress import Progress, silent
 
 MOST_CHILDREN = 65535
-
-HOLDS = Holds(
-    sizes=Span(how="logarithms in float16"),
-    colours=Span(how="256 numbers between the 0.1 and 99.9 %"),
-    opacities=Span(0.0, 1.0, 2.0**-11),
-    rotations=Span(-1.0, 1.0, 1 / 127),
-    sh=Span(how="255 numbers a degree"),
-    antialiased=False,
-)
 
 _PAGE = 65536
 _LEVEL = 6  # of deflate; 9 takes three times as long for 1 %

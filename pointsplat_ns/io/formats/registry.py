@@ -1,16 +1,13 @@
 """The formats of scene files: which there are, and which one a path means.
 
 One table decides for every file: what a file begins with, or for a zip archive what is in it, tells the format,
-whatever its name. Only formats without a sign of their own (``.splat``, ``.ksplat``) go by the name.
+whatever its name. Only ``.splat``, which has no sign of its own, goes by the name.
 """
 
 from __future__ import annotations
 
 import fnmatch
-import shutil
-import tempfile
 import zipfile
-import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,21 +17,13 @@ from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
-from pointsplat_ns.io.files import one_line, replacing, require_space
-from pointsplat_ns.io.formats import compressed_ply, glb_writing, ksplat, rad, sog, splat, spz_range
-from pointsplat_ns.io.formats.coding import PACKED, morton_order
-from pointsplat_ns.io.formats.compressed_ply import (
-    compressed_ply_bytes,
-    encode_compressed_ply,
-    is_compressed,
-    read_compressed_ply,
-)
-from pointsplat_ns.io.formats.glb import read_glb
-from pointsplat_ns.io.formats.glb_writing import encode_glb, glb_bytes
+from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.formats import sog, splat, spz_range
+from pointsplat_ns.io.formats.coding import morton_order
+from pointsplat_ns.io.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.io.formats.holding import Holds
-from pointsplat_ns.io.formats.ksplat import read_ksplat
 from pointsplat_ns.io.formats.rounding import Rounding
-from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog, write_sog_folder
+from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog
 from pointsplat_ns.io.formats.sog_images import META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import drawing_order, encode_splat, read_splat, splat_bytes
@@ -75,11 +64,6 @@ class Format:
     order: Callable[[Gaussians], Tensor] | None = None
     """Indices (N,) of a scene's Gaussians in the order in which they are written, if that is another."""
 
-    @property
-    def budget_suffix(self) -> str:
-        """Suffix of a size in a budget, such as ``.spz`` in 5MB.spz."""
-        return self.suffix if self.suffix.startswith(".") else ".sog"
-
     def fits(self, path: Path) -> bool:
         """Whether a file's name is one of this format."""
         name = path.name.lower()
@@ -97,59 +81,14 @@ def writer(encode: Callable[[Gaussians, Progress], bytes]) -> Writer:
     return write
 
 
-def read_zipped(path: Path) -> Gaussians:
-    """Read the one PLY, compressed or not, in a zip archive, as websites and mail send scenes. It is unpacked into a
-    temporary folder. Raises SceneError if there are several PLYs, the PLY declares more bytes than its packed bytes can
-    hold, does not fit on the disk, or is damaged."""
-    with tempfile.TemporaryDirectory(prefix="pointsplat-") as folder:
-        part = Path(folder) / "scene.ply"
-        name = _unpack(path, part)
-        try:
-            with part.open("rb") as stream:
-                compressed = is_compressed(read_header(stream, part))
-            return read_compressed_ply(part) if compressed else read_ply(part)
-        except SceneError as error:
-            raise SceneError(str(error).replace(str(part), f"{path}: {name}")) from error
-
-
-def _unpack(path: Path, part: Path) -> str:
-    """Write the one PLY of an archive to a file; its name in the archive."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            # Archives of macOS have a second entry for each file, with what its system keeps beside it.
-            entries = [
-                entry
-                for entry in archive.infolist()
-                if entry.filename.lower().endswith(".ply") and not entry.filename.rpartition("/")[2].startswith(".")
-            ]
-            if len(entries) != 1:
-                names = ", ".join(entry.filename for entry in entries[:3])
-                raise SceneError(f"{path}: {len(entries)} PLY files ({names}); expected one; unpack them")
-            [entry] = entries
-            if entry.file_size > max(1 << 22, PACKED * entry.compress_size):
-                raise SceneError(
-                    f"{path}: {entry.filename} has {entry.file_size} bytes, more than {entry.compress_size} compressed "
-                    "bytes of a scene can hold"
-                )
-            require_space(path, part.parent, entry.file_size)
-            with archive.open(entry) as packed, part.open("wb") as stream:  # no more than its size comes out
-                shutil.copyfileobj(packed, stream, 1 << 20)
-            return entry.filename
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, zlib.error) as error:
-        raise SceneError(f"{path}: damaged; its PLY cannot be unpacked ({one_line(error)})") from error
-
-
 _PLY = (b"ply\n", b"ply\r")
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
-_LCC = "convert them to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
+_CONVERT = "convert it to .ply or .sog with splat-transform, or open them in SuperSplat and export the scene"
 _EXPORT = "export the scene as .ply, .sog or .spz from the program that made it"
 
 FORMATS = (
     # Longer ends of names come before those that they end with; what several formats hold after what one holds.
-    Format(
-        "compressed PLY", ".compressed.ply", read_compressed_ply, writer(encode_compressed_ply), _PLY,
-        bytes_of=compressed_ply_bytes, capacity=compressed_ply.HOLDS, order=morton_order,
-    ),
+    Format("compressed PLY", ".compressed.ply", read_compressed_ply, starts=_PLY),
     Format("3DGS PLY", ".ply", read_ply, lambda scene, path, _: write_ply(scene, path), _PLY, bytes_of=ply_bytes,
            capacity=Holds(offset=True)),
     Format(
@@ -167,22 +106,18 @@ FORMATS = (
     ),
     Format("checkpoint", ".ckpt", read_checkpoint, starts=(b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P",), holds="data.pkl"),
     Format("streamed SOG", STREAM_META, read_sog_stream, capacity=sog.HOLDS),
-    Format(
-        "SOG folder", META, read_sog, write_sog_folder, encode=encode_sog, rounded=rounded_for_sog,
-        capacity=sog.HOLDS, order=morton_order,
-    ),
-    Format("ksplat", ".ksplat", read_ksplat, capacity=ksplat.HOLDS),
+    Format("SOG folder", META, read_sog),
     Format(
         "splat", ".splat", read_splat, writer(encode_splat), bytes_of=splat_bytes,
         capacity=splat.HOLDS, order=drawing_order,
     ),
-    Format("glTF", ".glb", read_glb, writer(encode_glb), (b"glTF",), bytes_of=glb_bytes, capacity=glb_writing.HOLDS),
-    Format("zipped PLY", "", read_zipped, holds="*.ply"),
-    Format("LCC", ".lcc", instead=_LCC), Format("LCC", ".lcc2", instead=_LCC),
+    Format("zip of a PLY", "", holds="*.ply", instead="unpack it and name the PLY"),
+    Format("ksplat", ".ksplat", instead=_CONVERT),
+    Format("LCC", ".lcc", instead=_CONVERT), Format("LCC", ".lcc2", instead=_CONVERT),
     Format("Postshot project", ".psht", instead=_EXPORT),
-    Format("RAD", ".rad", instead=_EXPORT, capacity=rad.HOLDS),
+    Format("RAD", ".rad", instead=_EXPORT, capacity=Holds(antialiased=False)),
     Format("USD", ".usdz", starts=(b"PXR-USDC", b"#usda"), holds="*.usd[ac]", instead=_EXPORT),
-    Format("glTF with separate files", ".gltf", instead="convert it to one .glb file"),
+    Format("glTF", ".glb", starts=(b"glTF",), instead=_EXPORT),
     Format("LAS point cloud", ".las", starts=(b"LASF",), instead="it holds points, no Gaussians"),
     Format("E57 point cloud", ".e57", starts=(b"ASTM-E57",), instead="it holds points, no Gaussians"),
     Format("Git LFS pointer", "", starts=(b"version https://git-lfs",), instead="fetch the file with git lfs pull"),
@@ -243,7 +178,7 @@ def _told_by_zip(path: Path) -> Format | None:
     told = next((kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None)
     if told is None:
         found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected one of a PLY, a SOG or a checkpoint")
+        raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected a SOG or a checkpoint")
     return told
 
 
@@ -258,11 +193,13 @@ def format_to_write(path: Path | str) -> Format:
 
 
 def format_like(path: Path) -> Format:
-    """The format to write what is made of a scene: that of the scene's file if it can be written, SOG for a SOG folder,
-    else PLY."""
+    """The format to write what is made of a scene: that of the scene's file if it can be written, SOG for a SOG folder
+    and a compressed PLY, else PLY."""
     if path.is_file() or path.is_dir():
         with suppress(SceneError):  # one that cannot be read, which its reader says
             kind = format_to_read(path)
+            if kind is not None and kind.read in (read_compressed_ply, read_sog):
+                return format_to_write(".sog")  # about as small
             if kind is not None and kind.write is not None:
-                return format_to_write(kind.budget_suffix)
+                return kind
     return format_to_write(".ply")

@@ -11,8 +11,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.coding import (
     Array,
     bytes_of_logits,
@@ -38,12 +37,10 @@ from pointsplat_ns.io.formats.coding import (
     unit_quats,
 )
 from pointsplat_ns.io.formats.holding import Holds, Span
-from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette, palette_size
+from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import META, Images, webp
-from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.tensors import FLOATS
 
 MAX_SIDE = 16_383
 """Pixels of a side of a WebP image, at most."""
@@ -60,8 +57,7 @@ def read_sog(path: Path | str) -> Gaussians:
     declares more than it can hold."""
     path = Path(path)
     with damage_named(path, "SOG"), closing(Images(path)) as images:
-        scene = _decode(images, images.meta(), path)
-    return keep_usable(scene, path)
+        return _decode(images, images.meta(), path)
 
 
 def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
@@ -73,53 +69,6 @@ def encode_sog(scene: Gaussians, progress: Progress = silent) -> bytes:
             # The same scene gives the same bytes, whenever it is written.
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
     return stream.getvalue()
-
-
-def sog_bytes_like(scene: Gaussians) -> Callable[[int], int]:
-    """Estimates the size of a SOG file by its number of Gaussians, in a small part of the time of encoding it.
-
-    The images of 10,000 Gaussians are encoded without SH. Four pieces of the palette are made, 256 entries each, from
-    every second of the neighbours in SH of four Gaussians, as clusters are no balls. An index has as many bytes as its
-    bits fill.
-
-    Args:
-        scene: N > 0 Gaussians, float32 on the CPU.
-    """
-    sample = scene[:: -(-len(scene) // 10_000)]
-    parts = sog_parts(sample.replace(features_rest=sample.features_rest[:, :0]), silent)
-    fixed = len(parts.pop(META))
-    each = sum(map(len, parts.values())) / len(sample)
-    if not scene.sh_degree:
-        return lambda count: round(fixed + each * count)
-    rows, most = scene.features_rest.flatten(1), palette_size(len(scene))
-    members, pieces = min(round(256 * max(len(rows) / most, 1)), len(rows)), []
-    for middle in rows[torch.linspace(0, len(rows) - 1, 4, **FLOATS).long()]:
-        near = (rows - middle).square().sum(dim=1).topk(min(2 * members, len(rows)), largest=False).indices[::2]
-        pieces.append(palette(rows[near], lambda share: None, 256)[0])
-    pixels = codebook(torch.cat(pieces))[1].reshape(-1, 3).numpy()
-    entry = len(webp(pixels, _ACROSS * rows.shape[1] // 3, 1024 // _ACROSS)) / 1024
-
-    def size(count: int) -> int:
-        entries = min(palette_size(count), count)
-        indices = count * math.log2(max(entries, 1)) / 8
-        return round(1.5 * fixed + each * count + entry * entries + indices)  # SH add a codebook to two
-
-    return size
-
-
-def write_sog_folder(scene: Gaussians, path: Path, progress: Progress = silent) -> None:
-    """Write the parts of a SOG file into the folder of ``path``, which is called ``meta.json``.
-
-    All parts are written beside before the first replaces an older one. Meanwhile there is no ``meta.json``, so that a
-    folder with it is whole. Errors are those of :func:`encode_sog` and :func:`~pointsplat_ns.io.files.replacing`.
-    """
-    parts = sog_parts(scene, progress)
-    with ExitStack() as stack:
-        # Left in the opposite order: meta.json comes last.
-        for name in [META, *(name for name in parts if name != META)]:
-            size = sum(map(len, parts.values())) if name == META else 0
-            stack.enter_context(replacing(path.with_name(name), size)).write_bytes(parts[name])
-        path.with_name(META).unlink(missing_ok=True)
 
 
 def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
@@ -275,15 +224,7 @@ def _position_steps(scene: Gaussians) -> Tensor:
     return (torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())).amax(dim=1)
 
 
-HOLDS = Holds(
-    positions=Span(how=f"{_LEVELS.bit_length()} bits of log(1 + abs(x)), with its sign"),
-    sizes=Span(-30.0, how=f"{LEVELS} own numbers"),
-    colours=Span(how=f"{LEVELS} own numbers"),
-    opacities=Span(0.0, 1.0, 1 / 255),
-    rotations=Span(-(0.5**0.5), 0.5**0.5, 2**0.5 / 255),
-    sh=Span(how=f"{LEVELS} own numbers, {_MOST_ENTRIES:,} rows"),
-    position_steps=_position_steps,
-)
+HOLDS = Holds(sizes=Span(-30.0), position_steps=_position_steps)
 
 
 def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:

@@ -15,10 +15,6 @@ from pointsplat_ns.io.files import require_file, require_memory
 from pointsplat_ns.io.formats.coding import Array
 
 META = "meta.json"
-PARTS = tuple(
-    f"{name}.webp" for name in ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
-)
-"""Names of the images that are written; a scene without SH has no shN."""
 
 
 class Images:

@@ -25,7 +25,7 @@ from pointsplat_ns.io.files import read_text, replacing, require_file, require_m
 from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts
 from pointsplat_ns.io.formats.sog_images import META
-from pointsplat_ns.io.usable import keep_usable, unusable_kept
+from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.system.progress import Progress, silent
 
 STREAM_META = "lod-meta.json"
@@ -70,11 +70,10 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
             files.append((_beside(path, environment), None))
     parts = []
     for file, count in files:
-        with unusable_kept():
-            parts.append(read_sog(file))
+        parts.append(read_sog(file))
         if count not in (None, len(parts[-1])):
             raise SceneError(f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}")
-    return keep_usable(joined(parts), path)
+    return joined(parts)
 
 
 def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
@@ -88,7 +87,7 @@ def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
         count = _meta(path)["lodLevels"]
     levels: list[Gaussians] = []
     for level in range(1, count):
-        levels.append(read_sog_stream(path, level))
+        levels.append(usable_part(read_sog_stream(path, level)))
         if sum(map(len, levels)) > 2 * finest:
             break
     return levels

@@ -27,20 +27,12 @@ from pointsplat_ns.io.formats.coding import (
     to_bytes,
     unit_quats,
 )
-from pointsplat_ns.io.formats.holding import FLOAT_SIZES, Holds, Span
-from pointsplat_ns.io.usable import keep_usable
+from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.system.progress import Progress, silent
 
 _ROW = np.dtype([("means", "<f4", 3), ("stds", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
-HOLDS = Holds(
-    sizes=FLOAT_SIZES,
-    colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)),
-    opacities=Span(0.0, 1.0, 1 / 255),
-    rotations=Span(-1.0, 127 / 128, 1 / 128),
-    sh=None,
-    antialiased=False,
-)
+HOLDS = Holds(colours=Span(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)), sh=None, antialiased=False)
 
 
 def read_splat(path: Path | str) -> Gaussians:
@@ -59,7 +51,7 @@ def read_splat(path: Path | str) -> Gaussians:
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
     with damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
-        scene = scene_of(
+        return scene_of(
             rows["means"],
             log_of_sizes(rows["stds"]),
             (rows["quats"].astype(np.float32) - 128) / 128,
@@ -67,7 +59,6 @@ def read_splat(path: Path | str) -> Gaussians:
             dc_of_shares(rows["rgba"][:, :3].astype(np.float32) / 255),
             np.empty((len(rows), 0, 3)),
         )
-    return keep_usable(scene, path)
 
 
 def splat_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:

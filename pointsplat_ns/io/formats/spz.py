@@ -1,9 +1,9 @@
 """SPZ files: Niantic's format, 20 bytes a Gaussian and one for each SH coefficient, compressed.
 
 Versions 2 and 3 are one gzip stream, with quaternions of three and four bytes. Version 4 has one zstd stream for each
-attribute. Positions are in fixed point of 24 bits. The format's documentation wants axes right, up, back (RUB);
-what is read and written here keeps the axes that it has, as most converters do. Where an extension of version 4 names
-other axes, the scene is turned to RUB.
+attribute; it is read, and version 3 is written, which most viewers read. Positions are in fixed point of 24 bits. The
+format's documentation wants axes right, up, back; what is read and written here keeps the axes that it has, as most
+converters do.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
@@ -37,12 +35,7 @@ from pointsplat_ns.io.formats.coding import (
 )
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.io.formats.spz_range import COLOUR_SCALE, MAX_FRACTION_BITS, SIZES, fitted, fraction_bits
-from pointsplat_ns.io.turning import turned
-from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.tensors import DOUBLES
-
-Version = Literal[3, 4]
 
 SH_BITS = (6, 5)
 """Bits that are kept of SH coefficients, of degree 1 and of the others, unless they have at most 8 bits already. Fewer
@@ -50,12 +43,8 @@ compress better. The format's own programs keep 5 and 4, in a file a seventh sma
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits after the point, flags, streams
-_FIRST_RECORD, _MAX_RECORDS = 32, 1 << 20  # bytes of version 4 before extensions, and up to their end
+_FIRST_RECORD = 32  # bytes of version 4 before extensions
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
-_AXES_EXTENSION = 0xADBE0003
-"""SPZ_ADOBE_coordinate_system: the axes of the numbers in the file."""
-_AXES = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # numbered from 1
-_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
 _XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
 
 
@@ -77,12 +66,11 @@ class _Head:
 
 def read_spz(path: Path | str) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, as :func:`~pointsplat_ns.io.read_scene` does. The axes stay those of the
-    file, unless it names others than right, up, back. Of SH degree 4, the highest band is left out, which is logged.
-    Raises SceneError if the file is of another kind or version, is truncated, or declares more than it can hold."""
+    file. Of SH degree 4, the highest band is left out, and extensions are not read, which is logged. Raises SceneError
+    if the file is of another kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
     with damage_named(path, "SPZ"):
-        scene = decode_spz(load_bytes(path), path)
-    return keep_usable(scene, path)
+        return decode_spz(load_bytes(path), path)
 
 
 def decode_spz(data: bytes, path: Path) -> Gaussians:
@@ -94,87 +82,38 @@ def decode_spz(data: bytes, path: Path) -> Gaussians:
         head, parts = _parts_of_zstd(data, path)
     else:
         raise SceneError(f"{path}: not an SPZ file (starts with {data[:4]!r}); expected gzip or {_MAGIC!r}")
-    axes = _named_axes(head, data, path) if head.flags & _EXTENDED else None
+    if head.flags & _EXTENDED:
+        logger.warning("%s: extensions of the SPZ file are not read", path)
     if head.degree > MAX_SH_DEGREE:
         logger.warning("%s: SH degree %d, read up to degree %d", path, head.degree, MAX_SH_DEGREE)
-    scene = _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
-    return scene if axes is None else turned(scene, axes)
+    return _decode(head, parts).replace(antialiased=bool(head.flags & _ANTIALIASED))
 
 
-def _named_axes(head: _Head, data: bytes, path: Path) -> Tensor | None:
-    """The matrix (3, 3) float64 from the axes that an extension of version 4 names to right, up, back; None if there is
-    no such extension. Others are not read, with a warning."""
-    found: Tensor | None = None
-    unread: dict[str, None] = {}
-    if head.version < 4:  # behind the compressed attributes
-        unread["all"] = None
-    else:
-        blocks = Blocks(data[: _table_of(data, path)], path, _FIRST_RECORD)
-        if len(blocks) > _MAX_RECORDS:
-            raise SceneError(f"{path}: {len(blocks)} bytes before the attributes; expected at most {_MAX_RECORDS}")
-        while blocks.position < len(blocks):
-            kind, size = blocks.take("<u4", 2).tolist()
-            content = blocks.take("u1", size)
-            number = int(content.view("<u4")[0]) if kind == _AXES_EXTENSION and size == 4 else 0
-            if 1 <= number <= len(_AXES):
-                columns = [_DIRECTIONS[letter] for letter in _AXES[number - 1]]
-                found = torch.tensor(columns, **DOUBLES).T
-            else:
-                unread[f"{kind:#x}"] = None
-    if unread:
-        logger.warning("%s: extensions of the SPZ file that are not read: %s", path, ", ".join([*unread][:4]))
-    return found
-
-
-def encode_spz(
-    scene: Gaussians,
-    progress: Progress = silent,
-    version: Version = 3,
-    sh_bits: tuple[int, int] | None = None,
-    level: int = 9,
-) -> bytes:
-    """The bytes of an SPZ file. The scene is brought into its range as by
-    :func:`~pointsplat_ns.io.formats.spz_range.fitted`.
+def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) -> bytes:
+    """The bytes of an SPZ file of version 3. The scene is brought into its range as by
+    :func:`~pointsplat_ns.io.formats.spz_range.fitted`. SH that were read from an SPZ file, or were rounded for one,
+    stay as they are.
 
     Args:
         scene: N Gaussians, float32 on the CPU.
         progress: called while compressing.
-        version: 3, which most viewers read, or 4, which loads sooner.
-        sh_bits: bits of SH coefficients, 1 to 8: of degree 1, and of the others. By default :data:`SH_BITS`; SH that
-            were read from an SPZ file, or were rounded for one, stay as they are.
-        level: of gzip in version 3, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
+        level: of gzip, 1 to 9. 6 takes a tenth of the time of 9, for 3 % more bytes.
 
     Raises:
-        SceneError: if the scene is too large for the format, or there are no such bits.
+        SceneError: if the scene is too large for the format.
     """
-    if sh_bits is None:
-        levels = 128 * scene.features_rest
-        sh_bits = (8, 8) if torch.equal(levels, levels.round()) else SH_BITS
-    if not all(1 <= bits <= 8 for bits in sh_bits):
-        raise SceneError(f"SH of {sh_bits[0]} and {sh_bits[1]} bits; expected 1 to 8 bits in SPZ")
+    levels = 128 * scene.features_rest
+    sh_bits = (8, 8) if torch.equal(levels, levels.round()) else SH_BITS
     n, flags = len(scene), _ANTIALIASED if scene.antialiased else 0
     scene, _ = fitted(scene)
     bits = fraction_bits(scene)
     parts = _encode(scene, bits, sh_bits)
-    if version == 3:
-        head = _HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0)
-        packer = zlib.compressobj(level, zlib.DEFLATED, 31)
-        packed = [packer.compress(head)]
-        for index, part in enumerate(parts):
-            progress("compressing", index / len(parts))
-            packed.append(packer.compress(part))
-        return b"".join([*packed, packer.flush()])
-    from zstandard import ZstdCompressor
-
-    parts = [part for part in parts if part]
-    streams = []
+    packer = zlib.compressobj(level, zlib.DEFLATED, 31)
+    packed = [packer.compress(_HEADER.pack(_MAGIC, 3, n, scene.sh_degree, bits, flags, 0))]
     for index, part in enumerate(parts):
         progress("compressing", index / len(parts))
-        streams.append(ZstdCompressor(level=12).compress(part))
-    head = _HEADER.pack(_MAGIC, 4, n, scene.sh_degree, bits, flags, len(parts))
-    head += struct.pack("<I12x", _FIRST_RECORD)  # where the table of sizes begins
-    table = b"".join(struct.pack("<QQ", len(s), len(p)) for s, p in zip(streams, parts, strict=True))
-    return b"".join([head, table, *streams])
+        packed.append(packer.compress(part))
+    return b"".join([*packed, packer.flush()])
 
 
 def rounded_for_spz(scene: Gaussians, rounding: Rounding) -> Gaussians:
@@ -226,7 +165,8 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
     if head.version != 4:
         raise SceneError(f"{path}: SPZ of version {head.version} outside gzip; expected version 4 there")
     require_plausible(path, sum(head.sizes), len(data), head.count, (head.degree + 1) ** 2 - 1)
-    sizes, table = [size for size in head.sizes if size], _table_of(data, path)
+    sizes = [size for size in head.sizes if size]
+    table = int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])  # where it begins; extensions are before it
     if head.streams != len(sizes) or table < _FIRST_RECORD:
         raise SceneError(
             f"{path}: {head.streams} streams listed at byte {table}; expected {len(sizes)} from byte {_FIRST_RECORD} on"
@@ -247,11 +187,6 @@ def _parts_of_zstd(data: bytes, path: Path) -> tuple[_Head, list[bytes | memoryv
             raise SceneError(f"{path}: truncated; a stream ends after {len(part)} of {size} bytes")
         parts.append(part)
     return head, parts + [b""] * (len(head.sizes) - len(parts))
-
-
-def _table_of(data: bytes, path: Path) -> int:
-    """Where the table of streams of version 4 begins, bytes. Extensions are before it."""
-    return int(Blocks(data, path, _HEADER.size).take("<u4", 1)[0])
 
 
 def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:

@@ -95,13 +95,4 @@ def _position_steps(scene: Gaussians) -> Tensor:
     return scene.means.new_full((len(scene),), math.ldexp(1.0, -fraction_bits(scene)))
 
 
-HOLDS = Holds(
-    positions=Span(how=f"{FARTHEST:,} steps each way, of 1 to 2^-{MAX_FRACTION_BITS}, usually 2^-{FRACTION_BITS}"),
-    sizes=SIZES,
-    colours=COLOURS,
-    opacities=Span(0.0, 1.0, 1 / 255),
-    rotations=Span(-(0.5**0.5), 0.5**0.5, 0.5**0.5 / 511),
-    sh=SH,
-    position_steps=_position_steps,
-    fitted=fitted,
-)
+HOLDS = Holds(sizes=SIZES, colours=COLOURS, sh=SH, position_steps=_position_steps, fitted=fitted)

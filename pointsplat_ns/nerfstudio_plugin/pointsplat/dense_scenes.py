@@ -20,7 +20,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.io.ply import read_ply
+from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
@@ -93,7 +93,7 @@ class DenseScene:
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the file, onto the CPU."""
-        return read_ply(self.source)
+        return read_scene(self.source)
 
     def dense(self, keep: bool) -> Gaussians:
         """The Gaussians, from the cache or the file. ``keep`` puts them into the cache if there is room."""

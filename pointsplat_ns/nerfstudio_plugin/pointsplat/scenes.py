@@ -27,6 +27,7 @@ from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
 from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
 from pointsplat_ns.io.splatfacto import read_checkpoint, read_photo_fit
+from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses, Split
@@ -142,7 +143,7 @@ class TrainedScene(DenseScene):
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the checkpoint, onto the CPU."""
-        return read_checkpoint(self.run.checkpoint)
+        return keep_usable(read_checkpoint(self.run.checkpoint), self.run.checkpoint)
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
