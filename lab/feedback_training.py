@@ -19,14 +19,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.closeness import DenseReference
+from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from pointsplat_ns.comparing.sizes import parse_resolution
 from pointsplat_ns.compression.compacted import Compacted, last_kept
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, default_device
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.photo_repair import Photos
+    from pointsplat_ns.photos.examples import Photos
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -213,12 +213,12 @@ def _read_photographed(
     scene: Source, looking: Looking, progress: bool | Progress, training: bool = True
 ) -> tuple[Gaussians, ViewSource, _Photos]:
     """The dense scene, its views and its photos; those to train on only with ``training``. Errors are those of
-    :func:`read_source`, and of :func:`~pointsplat_ns.compression.posed_photos.read_with_photos`; or a SceneError if the
+    :func:`read_source`, and of :func:`~pointsplat_ns.photos.posed_photos.read_with_photos`; or a SceneError if the
     photos of a run are wanted and there is no run, a DataError if its data is not found or unlike the scene."""
     if looking.photos is False:
         return *read_source(scene, looking), _Photos()
     if not isinstance(looking.photos, bool):
-        from pointsplat_ns.compression.posed_photos import read_with_photos
+        from pointsplat_ns.photos.posed_photos import read_with_photos
 
         with progress_bar(progress) as report:
             dense, posed = read_with_photos(
@@ -247,7 +247,7 @@ def _read_photographed(
 def _log_held_out(dense: Gaussians, results: tuple[Gaussians, ...], photos: _Photos) -> None:
     """Log the PSNR of results in held-out photos, if there are any."""
     if photos.held_out:
-        from pointsplat_ns.compression.posed_photos import held_out_text
+        from pointsplat_ns.photos.posed_photos import held_out_text
 
         log((held_out_text(dense.to(default_device()), results, photos.held_out),))
 

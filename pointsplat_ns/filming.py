@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
-from pointsplat_ns.compression.posed_scene import NO_POSES, read_found, without_poses
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import coarser_levels
@@ -20,6 +19,7 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_
 from pointsplat_ns.pages.camera_path import FPS, PHOTO_SIDE, FilmSettings, camera_path
 from pointsplat_ns.pages.film import SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
+from pointsplat_ns.photos.posed_scene import NO_POSES, read_found, without_poses
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.views import Views
 

@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import torch
 
+from pointsplat_ns.comparing.sizes import parse_resolution, size_text
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
@@ -43,7 +44,6 @@ from pointsplat_ns.io.files import (
 from pointsplat_ns.io.formats import format_like, format_to_write
 from pointsplat_ns.io.outputs import need_folder, need_new, need_suffix
 from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
-from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pages.gallery import draw_pair, pair_of, write_gallery, write_sheet

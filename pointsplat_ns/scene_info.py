@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.fill import fill
+from pointsplat_ns.comparing.sizes import parse_resolution
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.io.scene import kind_of, read_scene, source_parts
-from pointsplat_ns.looking.fill import fill
-from pointsplat_ns.looking.sizes import parse_resolution
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning.sh_bands import band_energies
@@ -51,7 +51,7 @@ class SceneInfo:
     up_is_guess: bool
     """Whether it was estimated without evidence that agrees."""
     fill: float | None
-    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.looking.fill.fill`) in sampled views; None if
+    """Mean number of Gaussians drawn per pixel (:func:`pointsplat_ns.comparing.fill.fill`) in sampled views; None if
     there are none."""
     views: str
     """Number and size of these views, as text."""

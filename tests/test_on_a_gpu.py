@@ -8,10 +8,10 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room, dense_config, same, small_refiner
+from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system.threads import fixed_threads

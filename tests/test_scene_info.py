@@ -9,8 +9,8 @@ from foreign import write_sog_folder
 
 import pointsplat_ns as ps
 from making import cloud
+from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 

@@ -27,13 +27,13 @@ from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.cli.scene_options import Share
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.outputs import need_folder
 from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import source_file
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render

@@ -137,9 +137,9 @@ def check_poses(poses: Path | None) -> None:
     """Raise a SceneError if a path cannot hold cameras because it is a run or a scene."""
     if poses is None:
         return
-    from pointsplat_ns.compression.posed_scene import without_poses
     from pointsplat_ns.errors import SceneError
     from pointsplat_ns.io.camera_files import CAMERA_KINDS, is_camera_file
+    from pointsplat_ns.photos.posed_scene import without_poses
 
     if not (without_poses(poses) or is_camera_file(poses)):
         raise SceneError(

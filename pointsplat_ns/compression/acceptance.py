@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from pointsplat_ns.comparing.closeness import Closeness, DenseReference
+from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import Closeness, DenseReference
-from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.progress import Progress, silent
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
 from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views

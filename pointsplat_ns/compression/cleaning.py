@@ -19,14 +19,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.closeness import DenseReference, views_text
+from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.geometry.transforms import invert_rigid
-from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.content import content_size, in_units
-from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.rasterizer import pixel_sums, pixels_of, render, render_depth

@@ -7,18 +7,19 @@ import functools
 import math
 import time
 
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
-from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, Photos, photo_repair
+from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.repair import repair
 from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.photos.examples import Photos
 from pointsplat_ns.system.progress import Progress, silent
 
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from pointsplat_ns.comparing.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Reason, closer_in
 from pointsplat_ns.compression.photo_repair import PhotoRepaired
 from pointsplat_ns.compression.quality import PhotoGain
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.views import Views
 
 

@@ -8,14 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import MOST_PSNR, SSIM_WINDOW, psnr_of
+from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
+from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View
@@ -108,25 +109,6 @@ class Adam:
 
     def _epsilon(self, name: str) -> float:
         return max(self._damping[name], 1e-15)
-
-
-class Example(NamedTuple):
-    """A view and the image that is wanted there."""
-
-    view: View
-    target: Tensor  # [H, W, 3] in [0, 1]
-    mask: Tensor | None = None  # [H, W, 1] bool, the pixels that count; None for all
-
-    def compared(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """An image of the view and the target on its device, both black where pixels do not count."""
-        target = self.target.to(image)
-        return (image, target) if self.mask is None else (image * self.mask.to(image), target * self.mask.to(image))
-
-    def psnr(self, image: Tensor) -> float:
-        """PSNR of an image of the view, over the pixels that count, dB; at most ``MOST_PSNR``."""
-        image, target = self.compared(image.double())
-        counted = 1.0 if self.mask is None else float(self.mask.double().mean())
-        return min(psnr_of(float((image - target).square().mean()), counted), MOST_PSNR)
 
 
 def optimised(

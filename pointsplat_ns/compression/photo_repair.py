@@ -16,31 +16,26 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import count as counted
 from itertools import cycle, islice
-from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, optimised, size_factors
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, optimised, size_factors
 from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
-from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.sizes import RESOLUTION, sides_of
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
+from pointsplat_ns.photos.examples import Example, Photos, every_kth_pixel, mean_psnr
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views, spread_indices
-
-Photos = Sequence[Example]
-"""Photos with the views that they show; read when they are asked for. Photos of uint8 count in 255ths."""
 
 
 @dataclass(frozen=True)
@@ -154,13 +149,6 @@ def _scenes(
         scene = reallocated(scene, pull, 0.2, views.for_merging())
 
 
-@torch.no_grad()
-def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
-    """Mean PSNR in some of the photos, dB, in every k-th of their pixels."""
-    shown = (every_kth_pixel(photos[index], sides_of(*RESOLUTION)[1], scene.device) for index in indices)
-    return fmean(photo.psnr(render(scene, photo.view)) for photo in shown)
-
-
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos in random order, each once before any is repeated, and renders of the dense scene; without end."""
     generator = random.Random(0)
@@ -176,28 +164,6 @@ def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSour
             with torch.no_grad():
                 example = next(renders)
             yield example
-
-
-def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: random.Random | None = None) -> Example:
-    """Every k-th pixel of a photo along each axis, and the view that draws exactly these pixels.
-
-    Args:
-        photo: the whole photo.
-        side: longer side that is wanted, pixels; k is the largest number that leaves at least as many.
-        device: of the result.
-        generator: draws the first column and row; by default the middle of k.
-    """
-    view = photo.view
-    k = max(1, max(view.width, view.height) // side)
-    left, top = (k // 2 if generator is None else generator.randrange(k) for _ in range(2))
-    image = in_unit_range(photo.target[top::k, left::k].to(device))
-    mask = None if photo.mask is None else photo.mask[top::k, left::k].to(device)
-    K = view.K.clone()
-    K[:2, 2] = (K[:2, 2] - K.new_tensor([left + 0.5, top + 0.5])) / k + 0.5
-    K[0, :2] /= k
-    K[1, 1] /= k
-    height, width = image.shape[:2]
-    return Example(replace(view, K=K, width=width, height=height, eps2d=view.eps2d / k**2), image, mask)
 
 
 @torch.no_grad()

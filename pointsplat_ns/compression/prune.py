@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.comparing.closeness import DenseReference, views_text
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, logger
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
-from pointsplat_ns.looking.closeness import DenseReference, views_text
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (

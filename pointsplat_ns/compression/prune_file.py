@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from pointsplat_ns.compression.posed_scene import PosesFile, without_poses
+from pointsplat_ns.comparing.sizes import RESOLUTION
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -17,12 +17,12 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_read
 from pointsplat_ns.io.ply import PlyRows, read_ply
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.merging.by_cells import merge_file
 from pointsplat_ns.merging.cells import Scratch
 from pointsplat_ns.merging.settings import MERGING
+from pointsplat_ns.photos.posed_scene import PosesFile, without_poses
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import check_jobs

@@ -1,8 +1,8 @@
 """How close a written scene is to the dense scene: one judgement, which commands, pages and pictures say in one text.
 
 Renders are compared in the views of :meth:`~pointsplat_ns.looking.view_source.ViewSource.whole`, at the size that
-people look at, in few of their pixels. For PSNR these are every k-th (:mod:`~pointsplat_ns.looking.sizes`). SSIM needs
-neighbours, so it takes bands of rows of each view, at other heights in each.
+people look at, in few of their pixels. For PSNR these are every k-th (:mod:`~pointsplat_ns.comparing.sizes`). SSIM
+needs neighbours, so it takes bands of rows of each view, at other heights in each.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 
 import torch
 
+from pointsplat_ns.comparing.closeness import DenseReference, views_text
+from pointsplat_ns.comparing.fill import fill
+from pointsplat_ns.comparing.sizes import subsampled
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
 from pointsplat_ns.io.usable import usable_part
-from pointsplat_ns.looking.closeness import DenseReference, views_text
-from pointsplat_ns.looking.fill import fill
-from pointsplat_ns.looking.sizes import subsampled
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.pruning import ply_bytes

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.closeness import Reference
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import Reference
 from pointsplat_ns.rasterizer import render_depth
 from pointsplat_ns.system.tensors import DOUBLES
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, Quality
 from pointsplat_ns.compression.requests import PruneRequest
@@ -29,7 +30,6 @@ from pointsplat_ns.levels.folder import write_levels
 from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.levels.tiles import placed, write_tiles
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels

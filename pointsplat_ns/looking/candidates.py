@@ -25,10 +25,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import curve_keys, invert_rigid, unit_cells
 from pointsplat_ns.looking.content import UNITS, thinned, thinning
-from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, log_widths, means_around

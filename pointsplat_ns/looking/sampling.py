@@ -11,13 +11,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.sizes import RESOLUTION
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.candidates import Candidates
 from pointsplat_ns.looking.content import UNITS, content_box, content_size, in_scene_units, in_units, thinned, thinning
 from pointsplat_ns.looking.poses import views_of
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.looking.sizes import RESOLUTION
 from pointsplat_ns.looking.surface import Surface
 from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, photo_places
 from pointsplat_ns.looking.upright import Up, known_up, pointing_up, upright_axis

@@ -125,11 +125,6 @@ class LookingSettings:
     photo_place_deviation: float = 0.15
     """Standard deviation of candidates from photo places along each axis, units."""
 
-    # Sizes of pictures (sizes.py)
-
-    smallest_side: int = 320
-    """Longer side of the smallest picture, and of subsampled ones, pixels."""
-
 
 LOOKING = LookingSettings()
 """The settings in use."""

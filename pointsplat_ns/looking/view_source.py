@@ -10,11 +10,11 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
+from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.sizes import RESOLUTION, middle_sized, two_sizes
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.views import View, Views, spread_indices
 
@@ -158,7 +158,7 @@ class ViewSource:
         return self.views(VIEW_COUNTS.compared)
 
     def compared(self) -> Views:
-        """The views in which renders are compared, at :func:`~pointsplat_ns.looking.sizes.middle_sized` size."""
+        """The views in which renders are compared, at :func:`~pointsplat_ns.comparing.sizes.middle_sized` size."""
         return middle_sized(self._whole)
 
     def scored(self, count: int) -> Views:
@@ -168,7 +168,7 @@ class ViewSource:
     def others(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
         is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
-        (:func:`~pointsplat_ns.looking.sizes.two_sizes`), the next time the other way around.
+        (:func:`~pointsplat_ns.comparing.sizes.two_sizes`), the next time the other way around.
 
         They are known views; if these are fewer than the compared ones, known and sampled ones in turn; if all known
         ones are compared, or there are none, sampled ones.

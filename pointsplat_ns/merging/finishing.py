@@ -2,7 +2,7 @@
 
 How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
 and differs between scenes. The factor is chosen by the PSNR against the dense scene in pictures of the
-middle size (:func:`~pointsplat_ns.looking.sizes.sides_of`).
+middle size (:func:`~pointsplat_ns.comparing.sizes.sides_of`).
 """
 
 from __future__ import annotations

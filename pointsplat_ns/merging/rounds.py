@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.merging.finishing import Finish, best_finish
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.matching import cheapest_pairs

@@ -20,10 +20,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import every_nth
-from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.merging.settings import MERGING, MergeSettings

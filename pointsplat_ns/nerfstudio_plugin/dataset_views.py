@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.compression.optimiser import Example
-from pointsplat_ns.compression.photo_repair import Photos
-from pointsplat_ns.compression.posed_scene import check_photos
 from pointsplat_ns.errors import DataError, MissingPackageError, SceneError, need
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
+from pointsplat_ns.photos.examples import Example, Photos
+from pointsplat_ns.photos.posed_scene import check_photos
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pointsplat_ns.comparing.sizes import parse_resolution, size_text
 from pointsplat_ns.compression.compact import compact_scene
-from pointsplat_ns.compression.photo_repair import Photos
-from pointsplat_ns.compression.posed_photos import read_with_photos
-from pointsplat_ns.compression.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, RepairBudget
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
-from pointsplat_ns.looking.sizes import parse_resolution, size_text
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos, view_source
+from pointsplat_ns.photos.examples import Photos
+from pointsplat_ns.photos.posed_photos import read_with_photos
+from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, Setting
@@ -79,7 +79,7 @@ def subject_at(
 ) -> Subject:
     """The scene at a path, with the options on views that its commands repeat; ``photos`` is a folder of photos. With
     ``training``, photos are also trained on. Errors are those of
-    :func:`~pointsplat_ns.compression.posed_photos.read_with_photos`, or say that the path is no run with photos."""
+    :func:`~pointsplat_ns.photos.posed_photos.read_with_photos`, or say that the path is no run with photos."""
     size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
     held_out: Callable[[], Photos] | None = None
     trained: Photos | None = None

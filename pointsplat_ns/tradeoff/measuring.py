@@ -18,15 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import Example
-from pointsplat_ns.compression.photo_repair import Photos
+from pointsplat_ns.comparing.sizes import middle_sized
 from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.looking.sizes import middle_sized
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.metrics import SSIM_WINDOW, ssim
+from pointsplat_ns.photos.examples import Example, Photos
 from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.cores import OtherPrograms, cores

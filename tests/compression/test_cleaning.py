@@ -8,6 +8,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import cleaning
 from pointsplat_ns.compression.cleaning import (
     FLOATING,
@@ -22,7 +23,6 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep

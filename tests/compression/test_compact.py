@@ -8,6 +8,8 @@ import torch
 
 import pointsplat_ns.compression.compact as compact_module
 from making import ball, same
+from pointsplat_ns.comparing.closeness import Closeness, DenseReference
+from pointsplat_ns.comparing.sizes import RendersOfSizes
 from pointsplat_ns.compression.acceptance import closer_in
 from pointsplat_ns.compression.compact import compact_scene
 from pointsplat_ns.compression.compacted import Compacted
@@ -16,9 +18,7 @@ from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import Closeness, DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RendersOfSizes
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, RefinerConfig

@@ -6,6 +6,7 @@ import math
 import pytest
 
 from making import cloud
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.budget_search import (
     SLOPE,
     FileLimit,
@@ -22,7 +23,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
 from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
 
 MOST = 100_000

@@ -11,9 +11,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.levels import folder as level_folder
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.merging import merge_levels
 
 ASKED = ("50%", "25%", "10%", "3%")

@@ -20,11 +20,12 @@ from pointsplat_ns.compression.optimiser import (
     gradients_of,
     size_factors,
 )
-from pointsplat_ns.compression.photo_repair import every_kth_pixel, photo_repair, reallocated, split
+from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.photos.examples import every_kth_pixel
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D

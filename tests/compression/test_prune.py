@@ -10,6 +10,7 @@ import torch
 import pointsplat_ns as ps
 from making import ball, box_room, same
 from pointsplat_ns.cli import main
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.pictures import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
@@ -18,7 +19,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.levels.stream import Node, partition
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource

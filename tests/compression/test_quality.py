@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from making import box_room
+from pointsplat_ns.comparing.closeness import DenseReference
+from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, quality_of_file, through_file
 from pointsplat_ns.io import save
-from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
 

@@ -10,10 +10,10 @@ import pointsplat_ns.compression.repair as repair_module
 import pointsplat_ns.compression.requests as requests
 from making import FewViews, ball, same
 from pointsplat_ns.api import example_room
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource

@@ -13,9 +13,9 @@ from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
-from pointsplat_ns.compression.posed_scene import read_posed
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.offsets import offset_for
+from pointsplat_ns.photos.posed_scene import read_posed
 
 UTM = (451_234.6, 5_412_345.7, 312.4)
 

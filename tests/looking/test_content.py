@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from making import ball, box_room
+from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
-from pointsplat_ns.looking.fill import fill
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from making import ball, normal_scene, photographed
+from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
-from pointsplat_ns.looking.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
 from pointsplat_ns.merging.state import Participants

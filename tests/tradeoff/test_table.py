@@ -13,11 +13,11 @@ import pointsplat_ns as ps
 from making import same_bits
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import compact, repair
-from pointsplat_ns.compression.optimiser import Example
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff import measuring, table
 from pointsplat_ns.tradeoff.making import Subject, make

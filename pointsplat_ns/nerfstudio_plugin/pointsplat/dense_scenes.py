@@ -17,12 +17,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from pointsplat_ns.comparing.sizes import RESOLUTION, subsampled
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RESOLUTION, subsampled
 from pointsplat_ns.nerfstudio_plugin.cameras import cameras_of_views, views_of_cameras
 from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
 from pointsplat_ns.rasterizer import render

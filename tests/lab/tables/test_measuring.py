@@ -10,8 +10,8 @@ from lab.tables.cells import Tables
 from lab.tables.measure import Judge
 from lab.tables.ways import WAYS
 from making import box_room
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.looking.closeness import DenseReference
 
 
 def cells_of(tables) -> dict:

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from making import ball, cloud
+from pointsplat_ns.comparing.closeness import DenseReference
+from pointsplat_ns.comparing.sizes import RendersOfSizes, parse_resolution, sides_of, subsampled
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.looking.closeness import DenseReference
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.sizes import RendersOfSizes, parse_resolution, sides_of, subsampled
 from pointsplat_ns.metrics import psnr, ssim
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views

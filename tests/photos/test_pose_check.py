@@ -10,7 +10,7 @@ import pointsplat_ns as ps
 from making import ball
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.turning import Similarity
-from pointsplat_ns.looking.pose_check import likeness, pose_faults
+from pointsplat_ns.photos.pose_check import likeness, pose_faults
 
 
 def statue(count: int = 3000, scale: float = 1.0) -> ps.Gaussians:

@@ -14,15 +14,17 @@ from dataclasses import replace
 
 import torch
 
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.closeness import DenseReference
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.views import Views
 
 RESOLUTION = (1920, 1080)
 """Width and height of sampled views, pixels: the size that most people look at."""
+
+SMALLEST_SIDE = 320
+"""Longer side of the smallest picture, and of subsampled ones, pixels."""
 
 
 def parse_resolution(text: str | tuple[int, int] | None) -> tuple[int, int] | None:
@@ -49,14 +51,14 @@ def size_text(resolution: tuple[int, int]) -> str:
 
 
 def sides_of(width: int, height: int) -> tuple[int, ...]:
-    """Longer sides of the pictures that renders are compared in, pixels: ``LOOKING.smallest_side``, the whole
+    """Longer sides of the pictures that renders are compared in, pixels: :data:`SMALLEST_SIDE`, the whole
     size, and their geometric mean. The whole size alone if it is no larger than the smallest.
 
     Example:
         >>> sides_of(1920, 1080), sides_of(540, 360), sides_of(64, 48)
         ((320, 784, 1920), (320, 416, 540), (64,))
     """
-    longest, smallest = max(width, height), LOOKING.smallest_side
+    longest, smallest = max(width, height), SMALLEST_SIDE
     return (longest,) if longest <= smallest else (smallest, round(math.sqrt(smallest * longest)), longest)
 
 
@@ -79,9 +81,9 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
         side: longer side of the whole pictures, pixels. If it is larger than the views' own, the pictures are as large
             as those of a camera that is nearer.
         drawn_side: longer side of what is drawn, pixels; at most that of ``views``. By default ``side``, and at most
-            ``LOOKING.smallest_side``.
+            :data:`SMALLEST_SIDE`.
     """
-    drawn = views.resized(min(side, LOOKING.smallest_side) if drawn_side is None else drawn_side)
+    drawn = views.resized(min(side, SMALLEST_SIDE) if drawn_side is None else drawn_side)
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 

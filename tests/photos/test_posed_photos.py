@@ -12,7 +12,6 @@ import torch
 import pointsplat_ns as ps
 from making import ball, views_from_within
 from pointsplat_ns.cli import main
-from pointsplat_ns.compression.posed_photos import read_posed_photos
 from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
@@ -20,6 +19,7 @@ from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking import photo_frame as module
 from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.photos.posed_photos import read_posed_photos
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, write_photos
 
 COUNT = 18

@@ -16,9 +16,6 @@ from typing import TypeVar
 
 import torch
 
-from pointsplat_ns.compression.optimiser import Example
-from pointsplat_ns.compression.photo_repair import Photos, mean_psnr
-from pointsplat_ns.compression.posed_scene import without_poses
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.lenses import lens_of
@@ -28,9 +25,11 @@ from pointsplat_ns.io.files import bytes_text, logger, require_memory
 from pointsplat_ns.io.photos import PhotoReader, photo_files, photos_of_cameras
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.photo_frame import in_frame
-from pointsplat_ns.looking.pose_check import POSE_CHECK, likeness
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
+from pointsplat_ns.photos.examples import Example, Photos, mean_psnr
+from pointsplat_ns.photos.frame import in_frame
+from pointsplat_ns.photos.pose_check import POSE_CHECK, likeness
+from pointsplat_ns.photos.posed_scene import without_poses
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices

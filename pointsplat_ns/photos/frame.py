@@ -26,7 +26,7 @@ from pointsplat_ns.io.camera_files.cameras import Motion
 from pointsplat_ns.io.camera_files.colmap import colmap_points
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.pose_check import POSE_CHECK, Likeness, Photo, likeness
+from pointsplat_ns.photos.pose_check import POSE_CHECK, Likeness, Photo, likeness
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
 

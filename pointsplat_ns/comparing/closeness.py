@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.each_view import each_view
 from pointsplat_ns.metrics import psnr_of
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.rasterizer import render_with_alpha

@@ -13,7 +13,7 @@ from pointsplat_ns.io.files import logger
 from pointsplat_ns.io.pictures import read_reduced
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run
 from pointsplat_ns.io.scene import read_scene
-from pointsplat_ns.looking.pose_check import POSE_CHECK, Photo, likeness, pose_faults
+from pointsplat_ns.photos.pose_check import POSE_CHECK, Photo, likeness, pose_faults
 from pointsplat_ns.views import Views, spread_indices
 
 

@@ -1,0 +1,1 @@
+"""Renders of scenes beside those of the dense scene."""

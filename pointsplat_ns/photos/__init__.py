@@ -1,0 +1,1 @@
+"""Photos and poses that belong to a scene."""
