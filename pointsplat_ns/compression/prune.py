@@ -70,9 +70,9 @@ def prune_scene(
 
         cleaning = clean_scene(dense, count or 1, views, progress)
         start = cleaning.apply(full, count or 1)
-    report = functools.partial(progress, f"by {request.by}")
     scored = functools.partial(views.scored, VIEW_COUNTS.scored)
     merging = request.method.score is None
+    report = functools.partial(progress, "merging" if merging else f"scoring by {request.by}")
     if count is not None and merging:
         merged = merge(start, count, report, views.for_merging())
         logger.debug("%s", merged.finish.note)

@@ -99,7 +99,7 @@ def merge_file(
         )
 
     def look() -> dict[str, Tensor]:
-        progress("looking", 0.0)
+        progress("looking for views", 0.0)
         with one_thread_each():
             return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
 

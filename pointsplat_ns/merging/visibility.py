@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -34,7 +35,10 @@ from pointsplat_ns.views import Views
 
 
 def views_and_weights(
-    participants: Participants, views: Views | Sampler | None, settings: MergeSettings
+    participants: Participants,
+    views: Views | Sampler | None,
+    settings: MergeSettings,
+    report: Callable[[float], None] = lambda share: None,
 ) -> tuple[Views | None, Tensor]:
     """The views that visibility is computed in, and the visibility weights (n,) of participants.
 
@@ -42,6 +46,7 @@ def views_and_weights(
         participants: n Gaussians.
         views: known views, or the sampler of those that people may have taken, by default a new one.
         settings: ``min_count_rendered``, ``sampled_views``, ``view_seed`` and those of the weights.
+        report: called with the share done.
 
     Returns:
         No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
@@ -52,11 +57,17 @@ def views_and_weights(
         with contextlib.suppress(DataError):
             found = sampler.views(settings.sampled_views, settings.view_seed)
             photos_found = sampler.photos is not None
-    weights = visibility_weights(participants, found, settings)
+    report(0.6)
+    weights = visibility_weights(participants, found, settings, lambda share: report(0.6 + 0.4 * share))
     return found, weights * trace_factors(participants.scene, participants.members) if photos_found else weights
 
 
-def visibility_weights(participants: Participants, views: Views | None, settings: MergeSettings) -> Tensor:
+def visibility_weights(
+    participants: Participants,
+    views: Views | None,
+    settings: MergeSettings,
+    report: Callable[[float], None] = lambda share: None,
+) -> Tensor:
     """Weights of the participants, (n,) float32, up to a common factor; 1 for all without views. In a large scene, one
     of several participants along the curve is drawn for all of them."""
     scene, members = participants.scene, participants.members
@@ -65,11 +76,17 @@ def visibility_weights(participants: Participants, views: Views | None, settings
     step = -(-len(members) // settings.max_count_drawn)
     rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
     drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
-    weights = covered_per_area(drawn, rows, participants.views_in_units(views), settings)
+    weights = covered_per_area(drawn, rows, participants.views_in_units(views), settings, report)
     return weights.repeat_interleave(step)[: len(members)]
 
 
-def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: MergeSettings = MERGING) -> Tensor:
+def covered_per_area(
+    scene: Gaussians,
+    rows: Tensor,
+    views: Views,
+    settings: MergeSettings = MERGING,
+    report: Callable[[float], None] = lambda share: None,
+) -> Tensor:
     """Covered pixels of some Gaussians over opacity times area, relative to one that is seen well.
 
     Args:
@@ -77,6 +94,7 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
         rows: (n,) indices, n at least 1.
         views: of the scene, in its own unit.
         settings: ``visibility_views`` and ``min_visibility``.
+        report: called with the share of the views done.
 
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
@@ -84,8 +102,9 @@ def covered_per_area(scene: Gaussians, rows: Tensor, views: Views, settings: Mer
     covered = torch.zeros(len(scene), **DOUBLES)
     small = views.spread(settings.visibility_views).resized(112)
     small = replace(small, rasterize_mode="antialiased")
-    for pixels in each_view(scene, small, pixels_of):
+    for done, pixels in enumerate(each_view(scene, small, pixels_of)):
         covered += pixels
+        report((done + 1) / len(small))
     stds = scene.stds[rows].double().sort(dim=1).values
     area = (scene.alphas[rows].double() * stds[:, 1] * stds[:, 2]).nan_to_num(0.0, 0.0, 0.0)
     ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)

@@ -163,7 +163,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     height = max(4 * math.ceil(n / width / 4), 4)
     if max(width, height) > MAX_SIDE:
         raise SceneError(f"{n} Gaussians; a SOG file holds at most {MAX_SIDE**2}")
-    progress("packing", 0.0)
+    progress("packing attributes", 0.0)
     scene = scene if ordered else scene[morton_order(scene)]
     images: dict[str, tuple[Array, int, int]] = {}
 
@@ -273,7 +273,7 @@ def _pack_sh(
 ) -> dict[str, Any]:
     """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
     rest = scene.features_rest.shape[1]
-    report = functools.partial(progress, "a palette of SH")
+    report = functools.partial(progress, "making the SH palette")
     rows, index = palette(scene.features_rest.flatten(1), report, weights=weights(scene))
     levels, level_index = codebook(rows)
     labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])
