@@ -298,7 +298,7 @@ def plot_views(
         views, resolution, up, data: as for :func:`prune`.
 
     Returns:
-        Text: the origin of the views, and the share of visible content in the views.
+        A line of text: how many views there are, and their origin.
 
     Raises:
         SceneError: if the scene is not usable, or the file cannot be written.
@@ -309,7 +309,7 @@ def plot_views(
         >>> import pointsplat_ns as ps
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     text = ps.plot_views(ps.example_room()[::20], f"{folder}/sheet.png", resolution="64x48")
-        >>> "of the visible content" in text
+        >>> "sampled poses" in text
         True
     """
     dense, source = read_source(scene, Looking(views, resolution, up, data))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ def write_levels(
     check_folder(folder, level_names(len(levels)), force)
     rows = []
     with ExitStack() as stack:
+        stack.callback(_remove_if_empty, folder)  # after an error
 
         def part_of(name: str) -> Path:
             return stack.enter_context(replacing(folder / name))
@@ -60,6 +61,11 @@ def write_levels(
             rows.append({"file": name, "bytes": part.stat().st_size, "sha256": content_hash(part), **fact})
         write_json({"format": "pointsplat-lod", "version": 2, **about, "levels": rows}, manifest)
         (folder / FOLDER_FILES.levels).unlink(missing_ok=True)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def level_names(count: int) -> list[str]:
