@@ -17,8 +17,8 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
-from pointsplat_ns.looking import photo_frame as module
 from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.photos import frame as module
 from pointsplat_ns.photos.posed_photos import read_posed_photos
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, write_photos
 
