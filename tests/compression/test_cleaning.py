@@ -15,7 +15,6 @@ from pointsplat_ns.compression.cleaning import (
     PLACES,
     Cleaning,
     clean_scene,
-    clusters,
     find_junk,
     floating_scores,
 )
@@ -254,14 +253,6 @@ def test_values_that_are_not_finite_are_no_floaters():
     odd.means[0, 0], odd.scales[1, 1], odd.opacities[2], odd.features_dc[3, 0] = math.nan, 1e4, -math.inf, 1e38
     junk = find_junk(Gaussians.cat([odd, scene]), floating=views, strength=1)
     assert set(junk.undrawable.tolist()) >= {0, 2} and not {0, 1, 2} & {*junk.floating.tolist()}
-
-
-def test_clusters_are_what_touches_the_largest_first():
-    places = torch.tensor([[9.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.6, 0.0, 0.0], [9.1, 0.0, 0.0]])
-    assert clusters(blobs(places, math.log(0.1), 0.0)).tolist() == [1, 0, 0, 0, 1]
-    assert clusters(blobs(places[:1], 0.0, 0.0)).tolist() == [0]
-    assert clusters(blobs(places[:0], 0.0, 0.0)).tolist() == []
-    assert clusters(blobs(places, 40.0, 0.0)).tolist() == [0] * 5, "of any size"
 
 
 def test_clean_keeps_the_others_bit_for_bit_and_at_least_one(tmp_path):

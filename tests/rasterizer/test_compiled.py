@@ -20,13 +20,13 @@ WIDTH, HEIGHT = 70, 45  # neither is a multiple of the tile
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
-def draw(channels=3, n=3000, cameras=1, **options):
+def draw(channels=3, n=3000, cameras=1, focal=50.0, **options):
     """Image, alphas, gradients and absolute gradients of random Gaussians of every opacity, some of them opaque; SH
     coefficients in place of channels where ``sh_degree`` is given."""
     *shape, sh = splats_in_view(n, seed=2, scale=-2.5, opacity=1.3, dtype=F64)
     shape[3].clamp_(max=1.0)
     colors = sh if "sh_degree" in options else torch.cat([sh[:, 0], sh[:, 1]], dim=1)[:, :channels]
-    K = torch.tensor([[50.0, 0, 33], [0, 52, 21], [0, 0, 1]]).repeat(cameras, 1, 1)
+    K = torch.tensor([[focal, 0, 33], [0, 52, 21], [0, 0, 1]]).repeat(cameras, 1, 1)
     views = torch.eye(4).repeat(cameras, 1, 1)
     views[:, 0, 3] = 0.3 * torch.arange(cameras)
     leaves = [t.to(F32).requires_grad_() for t in (*shape, colors, views)]
@@ -47,6 +47,9 @@ def draw(channels=3, n=3000, cameras=1, **options):
         {"rasterize_mode": "antialiased"},
         {"memory_budget": 100_000},
         {"n": 3},
+        {"focal": -50.0},  # a mirror
+        {"near_plane": 2.5, "far_plane": 3.5},
+        {"radius_clip": 6.0, "eps2d": 0.1},
     ],
     ids=str,
 )

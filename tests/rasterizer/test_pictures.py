@@ -105,8 +105,9 @@ def test_pictures_and_pixels_are_those_of_torch(change, mode):
     for ours, torchs in ((image, wanted), (alpha, wanted_alpha)):
         off = (ours - torchs).abs()
         assert off.max() < 1.5 / 255 and (off > 1e-4).float().mean() < 0.01
-    pixels = pixels_of(scene, view)
-    assert ((pixels - wanted_pixels).abs() > 1e-3 * (1 + wanted_pixels)).float().mean() < 0.02
+    for compiled in (None, False):
+        pixels = pixels_of(scene, view, compiled)
+        assert ((pixels - wanted_pixels).abs() > 1e-3 * (1 + wanted_pixels)).float().mean() < 0.02
     assert (float(alpha.sum()) == 0.0) == (change is _behind)
 
 
@@ -116,10 +117,11 @@ def test_pictures_and_pixels_are_those_of_torch(change, mode):
 @pytest.mark.parametrize("quality", ["exact", "balanced", "fast"])
 def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monkeypatch):
     scene, view = scene_of(degree), view_of()
-    at_once = drawing.render_with_alpha(scene, view, quality)
+    at_once, pixels = drawing.render_with_alpha(scene, view, quality), pixels_of(scene, view)
     monkeypatch.setattr(drawing, "MOST_PAIRS", 10)  # as a picture of too many pairs is drawn
     for ours, others in zip(at_once, drawing.render_with_alpha(scene, view, quality), strict=True):
         torch.testing.assert_close(ours, others, rtol=0, atol=1e-6)
+    torch.testing.assert_close(pixels_of(scene, view), pixels, rtol=1e-5, atol=1e-4)
 
 
 @needs_compiler

@@ -37,12 +37,6 @@ def written(command: str, log: Path) -> None:
     save_refiner(network, folder / "refiner.safetensors", known)
 
 
-def test_there_are_sixteen_networks_and_seeds_are_of_table_4():
-    assert len(NUMBER) == 16 and len({job.name for job in jobs(3)}) == 16 + 2 * 4
-    assert {job.way.name for job in jobs(2)[16:]} == {"pointsplat", "pointsplat-ii", "pointsplat-iii", "pointsplat-iv"}
-    assert {job.share for job in jobs() if job.way == WAYS.splatformer} == {0.5, 0.3, 0.1}
-
-
 @pytest.fixture()
 def small(trained_walls, tmp_path, no_lpips):
     """A function that trains networks of size tiny for three steps, never on wall-b."""
