@@ -1,5 +1,6 @@
 """Cleaning: planted junk goes, what is seen stays, counts are exact, and extremes change nothing."""
 
+import functools
 import math
 from collections.abc import Iterator
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import box_room, same_bits
+from making import box_room, same_bits, splats
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import cleaning
 from pointsplat_ns.compression.cleaning import (
@@ -54,17 +55,8 @@ def views(room) -> Views:
     return sample_views(room, 3, 64, 48)
 
 
-def blobs(places: torch.Tensor, log_scales: torch.Tensor | float, logit: float) -> Gaussians:
-    """Grey Gaussians at ``places`` (N, 3), of the SH degree of the room."""
-    n = len(places)
-    return Gaussians(
-        means=places,
-        scales=torch.zeros(n, 3) + log_scales,
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        opacities=torch.full((n, 1), logit),
-        features_dc=torch.ones(n, 3),
-        features_rest=torch.zeros(n, 3, 3),
-    )
+blobs = functools.partial(splats, colours=1.0, degree=1)
+"""Grey Gaussians, of the SH degree of the room."""
 
 
 def behind_the_walls(n: int = PLANTED) -> torch.Tensor:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from making import ball, box_room
+from making import ball, box_room, splats
 from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import UNITS, content_size, in_units, thinned
@@ -59,15 +59,8 @@ VIEWS = Views(torch.eye(4)[None], K, 100, 100, torch.zeros(3))
 
 def flat(x: float, stds: tuple[float, float], alpha: float, turn: float = 0.0, copies: int = 1) -> Gaussians:
     """Flat Gaussians that face the camera, at (x, 0, 5); ``turn`` radians about its axis."""
-    scene = Gaussians.empty().replace(
-        means=torch.tensor([[x, 0.0, 5.0]]),
-        scales=torch.tensor([[*stds, 1e-9]]).log(),
-        quats=torch.tensor([[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]]),
-        opacities=torch.tensor([[alpha]]).logit(),
-        features_dc=torch.zeros(1, 3),
-        features_rest=torch.zeros(1, 0, 3),
-    )
-    return scene[torch.zeros(copies, dtype=torch.int64)]
+    means, quat = torch.tensor([[x, 0.0, 5.0]] * copies), [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+    return splats(means, torch.tensor([*stds, 1e-9]).log(), torch.tensor(alpha).logit(), quats=quat)
 
 
 def rectangle(reach: float, stds: tuple[float, float]) -> float:

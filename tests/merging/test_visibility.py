@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, normal_scene, photographed
+from making import ball, normal_scene, photographed, splats
 from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.content import views_in_units
@@ -34,13 +34,8 @@ def wall(z: float, rows: int = 32, size: float = 2.0) -> Gaussians:
     """A wall of flat, opaque Gaussians that touch each other."""
     line = torch.linspace(-1, 1, rows)
     across = torch.cartesian_prod(line, line) * size / 2
-    scene = ball(len(across), 0)
-    return scene.replace(
-        means=torch.cat([across, torch.full((len(across), 1), z)], dim=1),
-        scales=torch.tensor([size / rows, size / rows, 0.01]).log().expand(len(across), 3),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(across), 4),
-        opacities=torch.full((len(across), 1), 4.0),
-    )
+    means = torch.cat([across, torch.full((len(across), 1), z)], dim=1)
+    return splats(means, torch.tensor([size / rows, size / rows, 0.01]).log(), 4.0)
 
 
 def two_walls() -> Gaussians:

@@ -258,8 +258,8 @@ def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, sai
         assert len(ps.load(tmp_path / "small.ply")) == 250
 
 
-@pytest.mark.parametrize("how", ["python", "prune", "tradeoff"])
-def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, said, capsys):
+@pytest.mark.parametrize("how", ["prune", "tradeoff"])
+def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, capsys):
     shown = scene.replace(features_dc=scene.features_dc + 0.3) if how == "tradeoff" else scene
     folder, model = write_photos(shown, views, tmp_path / "images"), write_colmap_binary(views, tmp_path / "model")
     path = tmp_path / "room.ply"
@@ -273,12 +273,8 @@ def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, 
         command = sweep["points"][2]["command"]
         assert f"--photos {folder}" in command and f"--poses {model}" in command
         return
-    if how == "python":
-        ps.prune(scene, "50%", photos=folder, views=model)
-    else:
-        main(["prune", str(path), *words, "-o", str(tmp_path / "small.ply")])
-    text = said.text if how == "python" else capsys.readouterr().out
-    pruned, dense = map(float, re.search(TEXT.replace(r"([\d.]+) -> ", ""), text).groups())
+    main(["prune", str(path), *words, "-o", str(tmp_path / "small.ply")])
+    pruned, dense = map(float, re.search(TEXT.replace(r"([\d.]+) -> ", ""), capsys.readouterr().out).groups())
     assert dense > pruned + 1
 
 

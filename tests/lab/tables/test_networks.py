@@ -10,7 +10,7 @@ import pointsplat_ns as ps
 from lab.tables import figures, networks
 from lab.tables.networks import jobs
 from lab.tables.ways import WAYS
-from making import box_room, parsed_by_ns_train
+from making import box_room
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.refiner import Refiner, preset, read_metadata
 from pointsplat_ns.refiner.weights import save_refiner
@@ -35,6 +35,20 @@ def written(command: str, log: Path) -> None:
     known["lpips_weight"] = float(model["lpips-weight"])
     folder = Path(given["output-dir"]) / given["experiment-name"] / "pointsplat" / given["timestamp"]
     save_refiner(network, folder / "refiner.safetensors", known)
+
+
+def parsed_by_ns_train(command: str):
+    """The config that ns-train makes of a command line."""
+    import tyro
+
+    from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
+
+    import_nerfstudio()
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+    program, *words = shlex.split(command)
+    assert program == "ns-train"
+    return tyro.cli(AnnotatedBaseConfigUnion, args=words)
 
 
 @pytest.fixture()
