@@ -8,7 +8,7 @@ import pytest
 
 from lab.common.programs import ProgramFailed, run_measured
 
-PARENT, CHILD = 2**30, 200_000_000
+PARENT, CHILD = 2**29, 100_000_000
 """Bytes held by the process that measures, and by the one that is measured."""
 
 
