@@ -195,9 +195,7 @@ def test_what_a_given_view_shows_is_not_unseen(room):
     viewmat = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]])
     K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]])
     behind = Views(viewmat[None].double(), K[None], 32, 32, torch.zeros(3))
-    hidden, shown = {*find_junk(scene).unseen.tolist()}, {*find_junk(scene, floating=behind).unseen.tolist()}
     near = {*range(ROOM + 1, ROOM + PLANTED, 2)}  # those on the side of the camera
-    assert near <= hidden and not near & shown
     cleanings = [clean_scene(scene, 1, source) for source in (ViewSource(scene, given=behind), ViewSource(scene))]
     assert [near & {*cleaning.junk.unseen.tolist()} for cleaning in cleanings] == [set(), near]
     assert not any(len(cleaning.junk.floating) or "float" in str(cleaning.notes) for cleaning in cleanings)

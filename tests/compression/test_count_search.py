@@ -199,6 +199,6 @@ def test_all_are_kept_unrounded_if_all_fit():
     full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
     found = largest_within(full, lambda count: full[:count], limit, lambda share: None)
     assert found.scene is full and found.limit.rounded(full) is full
-    larger = cloud(3000, seed=1)  # as a repair may make one
+    larger = cloud(1000, seed=1)  # as a repair may make one
     tight = FileLimit(found.limit.kind, found.limit.bytes_of(larger) * 4 // 5)
     assert tight.bytes_of(tight.rounded(larger)) <= tight.most

@@ -25,6 +25,7 @@ from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, Phot
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.photos import examples
 from pointsplat_ns.photos.examples import every_kth_pixel
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
@@ -53,9 +54,10 @@ def photos(hollow_ball):
 
 def test_unseen_photos_are_in_no_step_and_the_others_in_turn(hollow_ball, pruned, photos, monkeypatch):
     taken = []
-    monkeypatch.setattr(
-        module, "every_kth_pixel", lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest)
-    )
+    for place in (module, examples):
+        monkeypatch.setattr(
+            place, "every_kth_pixel", lambda photo, *rest: taken.append(id(photo)) or every_kth_pixel(photo, *rest)
+        )
     photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     unseen = [id(photo) for photo in photos[::8]]
     # 35 of 40 steps take a photo, 1 of 8 a render of the dense scene; 12 photos of steps and 3 others are compared.

@@ -70,7 +70,7 @@ def test_images_and_gradients_are_those_of_torch(options, monkeypatch):
 @needs_compiler
 def test_any_number_of_threads_draws_the_same_bits():
     assert_same_on_any_threads(
-        lambda: draw(n=9000, sh_degree=3, rasterize_mode="antialiased", memory_budget=400_000, compiled=True)
+        lambda: draw(n=5000, sh_degree=3, rasterize_mode="antialiased", memory_budget=400_000, compiled=True)
     )
 
 

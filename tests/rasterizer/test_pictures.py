@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 67, 43
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
 
-def scene_of(degree=3, count=3000):
+def scene_of(degree=3, count=1500):
     """Gaussians in and around a picture, and behind the camera."""
     scene = normal_scene(count, degree, seed=3)
     means = scene.means * torch.tensor([2.0, 1.5, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
@@ -127,7 +127,7 @@ def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monk
 @needs_compiler
 @torch.no_grad()
 def test_pictures_are_the_same_on_any_threads():
-    scene, view = scene_of(count=30_000), view_of()
+    scene, view = scene_of(count=12_000), view_of()
     assert_same_on_any_threads(lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)])
 
 
