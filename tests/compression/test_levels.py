@@ -132,8 +132,6 @@ def test_existing_files_are_only_overwritten_by_force(taken, scene, levels, tmp_
         (["0.0001MB"], "level 0.0001MB: keep is 0.0001MB, too small for one Gaussian"),
         ([True], "level True: keep is True"),
         ("", "no level given"),
-        (["auto:35"], "level auto:35: expected a ratio"),
-        (["50%", "10%", 200], "levels 50% and 200 both mean 200 of 400 Gaussians; leave one out"),
     ],
 )
 def test_levels_that_do_not_fit_are_refused_and_nothing_is_written(asked, message, scene, tmp_path):
