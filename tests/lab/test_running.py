@@ -52,7 +52,6 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
     assert paper_dataset(replica(tmp_path / "few", "office2", frames=3)) == ""
     # Drawn rooms are of the same layout and may be called the same.
     assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""
-    assert paper_dataset(replica(tmp_path / "small", "room0", (320, 240))) == ""
 
 
 @pytest.mark.parametrize(

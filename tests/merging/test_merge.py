@@ -141,7 +141,7 @@ def test_a_merger_gives_what_merging_alone_gives_in_any_order_of_counts():
     scene = Gaussians.cat([wall(20), faint])
     settings = replace(RENDERED, sampled_views=4, finish_views=1)
     merger = Merger(scene, settings=settings)
-    for k in (150, 30, 250, 149, 1, 405, len(scene)):
+    for k in (150, 405, 149, len(scene)):
         merged, alone = merger.merged(k), merge(scene, k, settings=settings)
         assert same(merged.scene, alone.scene) and torch.equal(merged.assignment, alone.assignment)
     for k in (0, len(scene) + 1):

@@ -120,7 +120,7 @@ values = st.one_of(
 )  # few values, so that ties are common
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.lists(values, max_size=30).flatmap(lambda x: st.tuples(st.just(x), st.integers(0, len(x)))))
 def test_select_is_its_definition(case):
     scores, k = case
@@ -149,7 +149,7 @@ def shares_by_definition(masses, run, first):
     return result
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40), st.integers(1, 7), st.data())
 def test_mass_shares_are_their_definition(masses, run, data):
     first = data.draw(st.integers(0, run - 1))

@@ -1,7 +1,6 @@
-"""Compiled kernels find the tiles, make the colours and draw the images that torch does."""
+"""Compiled kernels make the colours and draw the images that torch does."""
 
 import math
-from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -10,9 +9,7 @@ import torch
 from making import assert_same_on_any_threads, splats_in_view
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.compiled import blending
-from pointsplat_ns.rasterizer.ellipses import Region
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
-from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.kernels import KERNELS
 
 F32, F64 = torch.float32, torch.float64
@@ -135,36 +132,3 @@ def test_rows_of_no_gaussian_are_refused_before_memory_is_read():
     for wrong in (-1, len(coefficients)):
         with pytest.raises(IndexError, match=f"ids are from .*{wrong}.*expected rows of 500 Gaussians"):
             sh_to_color(directions[:2], coefficients[:, 0], coefficients[:, 1:], 3, torch.tensor([3, wrong]))
-
-
-# Tiles
-
-
-def footprints(compiled, count=6000, size=(203, 149)):
-    """Of Gaussians in and around an image, from points to needles and some larger than an image, some too faint to
-    draw."""
-    g = torch.Generator().manual_seed(1)
-    means2d = torch.rand(6000, 2, generator=g) * 400 - 100
-    xx, yy = (10.0 ** (4 * torch.rand(6000, 2, generator=g) - 1)).unbind(-1)
-    share = (2 * torch.rand(6000, generator=g) - 1) * 0.999
-    cov2d = torch.stack([xx, share * (xx * yy).sqrt(), yy], -1)
-    opacities, depths = torch.rand(6000, generator=g) ** 4, torch.randn(6000, generator=g).abs()
-    values = [means2d, cov2d, xx * yy * (1 - share * share), opacities, depths]
-    names = ("means2d", "cov2d", "det", "opacities", "depth_keys")
-    seen = SimpleNamespace(**{name: value[:count] for name, value in zip(names, values, strict=True)})
-    return Footprints(seen, *size, compiled=compiled)
-
-
-REGIONS = (Region(0, 19, 0, 26), Region(3, 4, 0, 26), Region(5, 6, 7, 8), Region(18, 19, 25, 26))
-
-
-@needs_compiler
-def test_pairs_are_those_of_torch():
-    ours, torchs = (footprints(compiled) for compiled in (True, False))
-    assert ours.whole == torchs.whole == REGIONS[0]
-    assert ours.regions(5000) == torchs.regions(5000) and len(ours.regions(5000)) > 3
-    for region in REGIONS:
-        mine, theirs = ours.tiles(region), torchs.tiles(region)
-        assert len(theirs.gaussians) > 0
-        for name in ("gaussians", "offsets", "places", "counts", "order"):
-            assert torch.equal(getattr(mine, name), getattr(theirs, name)), (region, name)
