@@ -11,14 +11,7 @@ import pointsplat_ns as ps
 from making import box_room, same_bits, splats
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import (
-    FLOATING,
-    PLACES,
-    Cleaning,
-    clean_scene,
-    find_junk,
-    floating_scores,
-)
+from pointsplat_ns.compression.cleaning import FLOATING, PLACES, Cleaning, clean_scene, find_junk, floating_scores
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError

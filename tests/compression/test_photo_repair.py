@@ -11,15 +11,7 @@ import pointsplat_ns as ps
 from making import FewViews, views_from_within
 from pointsplat_ns.compression import photo_repair as module
 from pointsplat_ns.compression.compact import compact_scene
-from pointsplat_ns.compression.optimiser import (
-    RATES,
-    Adam,
-    AdamSettings,
-    Example,
-    extent,
-    gradients_of,
-    size_factors,
-)
+from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, gradients_of, size_factors
 from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError
@@ -67,11 +59,7 @@ def test_unseen_photos_are_in_no_step_and_the_others_in_turn(hollow_ball, pruned
 
 @pytest.mark.parametrize(
     ("faster", "unseen", "text"),
-    [
-        (8.0, 0.4, "trained on 15 photos by 40"),
-        (1e4, 0.4, "brings less than 0.1 dB"),
-        (8.0, -0.4, "other photos lose"),
-    ],
+    [(8.0, 0.4, "trained on 15 photos by 40"), (1e4, 0.4, "brings less than 0.1 dB"), (8.0, -0.4, "other photos lose")],
 )
 def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(faster, unseen, text, hollow_ball, monkeypatch):
     """Steps that are far too long harm; photos in which colours go the other way lose."""

@@ -11,14 +11,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.merging import MERGING
 from pointsplat_ns.merging import covariance as algebra
-from pointsplat_ns.merging.covariance import (
-    covariances,
-    overlap,
-    plane_axes,
-    projected,
-    projected_area,
-    rms_area,
-)
+from pointsplat_ns.merging.covariance import covariances, overlap, plane_axes, projected, projected_area, rms_area
 from pointsplat_ns.merging.pair_cost import DIRECTIONS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
 from pointsplat_ns.merging.state import Participants, State, initial_state
 from pointsplat_ns.system.kernels import KERNELS

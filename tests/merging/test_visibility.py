@@ -15,11 +15,7 @@ from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
 from pointsplat_ns.merging.state import Participants
-from pointsplat_ns.merging.visibility import (
-    covered_per_area,
-    views_and_weights,
-    visibility_weights,
-)
+from pointsplat_ns.merging.visibility import covered_per_area, views_and_weights, visibility_weights
 from pointsplat_ns.views import Views
 
 

@@ -7,12 +7,7 @@ import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.view_scores import (
-    lightgaussian_score,
-    log_determinant,
-    pup_score,
-    sensitivity,
-)
+from pointsplat_ns.pruning.view_scores import lightgaussian_score, log_determinant, pup_score, sensitivity
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from pointsplat_ns.rasterizer.projection import project
