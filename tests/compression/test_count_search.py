@@ -13,7 +13,6 @@ from pointsplat_ns.compression.budget_search import (
     few_psnr,
     find_count,
     largest_within,
-    needed_sh_degree,
     smallest_within,
 )
 from pointsplat_ns.compression.prune import prune_scene
@@ -112,18 +111,6 @@ def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
     for wanted in (0.0, -3.0, math.nan, math.inf):
         with pytest.raises(BudgetError, match="expected a positive number"):
             smallest_within(len(hollow_ball), lambda k: hollow_ball[:k], psnr_of, wanted)
-
-
-def test_the_sh_degree_found_is_the_lowest_that_is_good_enough(hollow_ball, ball_views):
-    reference = DenseReference(hollow_ball, ball_views)
-    reached = [reference.psnr(cut_sh(hollow_ball, degree))[0] for degree in range(3)]
-    assert reached[0] < reached[1] < reached[2] == math.inf
-    for degree in (0, 1):
-        assert needed_sh_degree(hollow_ball, ball_views, reached[degree] - 0.01) == (
-            degree,
-            pytest.approx(reached[degree]),
-        )
-    assert needed_sh_degree(hollow_ball, ball_views, reached[1] + 0.01) == (2, math.inf)
 
 
 def search(full, limit, encode=encode_spz):
