@@ -1,7 +1,6 @@
 """Photos in a folder with the poses of a file of cameras: found, brought into the scene's frame, split and checked."""
 
 import json
-import logging
 import re
 from dataclasses import replace
 
@@ -26,11 +25,6 @@ COUNT = 18
 
 
 @pytest.fixture(scope="module")
-def scene() -> ps.Gaussians:
-    return ball(500)
-
-
-@pytest.fixture(scope="module")
 def views() -> ps.Views:
     """Cameras in order of their names; the first photos are named first."""
     return views_from_within((0.2, 0.1, 0.0), COUNT, 64, 48)
@@ -39,12 +33,6 @@ def views() -> ps.Views:
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
-
-
-@pytest.fixture()
-def said(caplog) -> pytest.LogCaptureFixture:
-    caplog.set_level(logging.INFO, logger="pointsplat_ns")
-    return caplog
 
 
 def moved(views: ps.Views, turn: torch.Tensor | None = None, scale: float = 1.0, flipped: bool = False) -> ps.Views:
