@@ -51,6 +51,9 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     assert f"; the next best, the b, loses {loss} 90 Gaussians, 0.900 kB in place of 5.00 kB, " in why
     assert "50 ms a frame in place of 100, made in 3 s" in why
     assert "next best" not in recommend([dense], 0.5)[1]
+    for trusted, what in ((True, "the fastest point that"), (False, "the point with the fewest Gaussians that")):
+        best, why = recommend([dense, poor, other], 2.5, trusted)
+        assert best is other and why.startswith(f"{what} ") and (" ms" in why) == trusted
 
 
 def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):

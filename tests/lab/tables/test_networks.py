@@ -52,10 +52,10 @@ def test_an_interrupted_training_goes_on_where_it_was(small, tmp_path, monkeypat
     asked = []
     monkeypatch.setattr(networks, "run", lambda command, log: asked.append(shlex.split(command)))
     folder = tmp_path / "networks" / "pointsplat-iii-10" / "pointsplat" / "run"
-    write_run(folder, 2, 3)
-    small(shard=NUMBER["pointsplat-iii-10"])
+    write_run(folder, 2, 5)
+    small(shard=NUMBER["pointsplat-iii-10"], steps=5)
     options = dict(zip(asked[0], asked[0][1:], strict=False))
-    assert (options["--max-num-iterations"], options["--load-dir"]) == ("1", str(folder / "nerfstudio_models"))
+    assert (options["--max-num-iterations"], options["--load-dir"]) == ("3", str(folder / "nerfstudio_models"))
     (folder / "refiner.safetensors").touch()
     small(shard=NUMBER["pointsplat-iii-10"])
     assert len(asked) == 1, "it is finished"
