@@ -39,7 +39,7 @@ def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp
     made.close(5.0)
 
 
-def test_a_share_is_there_at_once_by_coverage_and_then_merged_as_prune_does(levels, scene):
+def test_a_share_is_there_at_once_by_coverage_and_then_merged(levels, scene):
     for percent in (1, 20):
         level = levels.at(percent)
         assert same(level.scene, ps.prune(scene, percent / 100, by="coverage"))

@@ -74,7 +74,7 @@ def test_cameras_that_stand_in_large_gaussians_are_told():
     assert faults.text.endswith(f", {faults.smeared} of them nothing but a blur") and faults.smeared > 4
 
 
-def test_small_objects_and_scenes_of_few_large_gaussians_pass_in_their_views():
+def test_small_objects_and_few_large_gaussians_pass_in_their_views():
     assert pose_faults(statue(), around(16.0, focal=300.0)).text == "", "a fiftieth of the picture"
     scene = ball(500)
     assert pose_faults(scene, ps.sample_views(scene, 8, 64, 48)).text == ""
