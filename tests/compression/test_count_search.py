@@ -13,7 +13,6 @@ from pointsplat_ns.compression.budget_search import (
     few_psnr,
     find_count,
     largest_within,
-    needed_sh_degree,
     smallest_within,
 )
 from pointsplat_ns.compression.prune import prune_scene
@@ -114,30 +113,9 @@ def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
             smallest_within(len(hollow_ball), lambda k: hollow_ball[:k], psnr_of, wanted)
 
 
-def test_the_sh_degree_found_is_the_lowest_that_is_good_enough(hollow_ball, ball_views):
-    reference = DenseReference(hollow_ball, ball_views)
-    reached = [reference.psnr(cut_sh(hollow_ball, degree))[0] for degree in range(3)]
-    assert reached[0] < reached[1] < reached[2] == math.inf
-    for degree in (0, 1):
-        assert needed_sh_degree(hollow_ball, ball_views, reached[degree] - 0.01) == (
-            degree,
-            pytest.approx(reached[degree]),
-        )
-    assert needed_sh_degree(hollow_ball, ball_views, reached[1] + 0.01) == (2, math.inf)
-
-
 def search(full, limit, encode=encode_spz):
     limit = FileLimit(Format("SPZ", ".spz", encode=encode), limit)
     return largest_within(full, lambda count: full[:count], limit, lambda share: None)
-
-
-def test_the_file_fits_and_is_not_much_smaller():
-    full = cloud(4000)
-    for limit in (5000, 20_000, 60_000):
-        found = search(full, limit)
-        size = found.tried[len(found.scene)]
-        assert 0.95 * limit <= size <= limit
-        assert size == len(encode_spz(found.scene))
 
 
 def test_a_budget_for_less_than_one_gaussian_is_refused():
@@ -208,6 +186,6 @@ def test_all_are_kept_unrounded_if_all_fit():
     full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
     found = largest_within(full, lambda count: full[:count], limit, lambda share: None)
     assert found.scene is full and found.limit.rounded(full) is full
-    larger = cloud(3000, seed=1)  # as a repair may make one
+    larger = cloud(1000, seed=1)  # as a repair may make one
     tight = FileLimit(found.limit.kind, found.limit.bytes_of(larger) * 4 // 5)
     assert tight.bytes_of(tight.rounded(larger)) <= tight.most

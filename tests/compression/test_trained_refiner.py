@@ -45,15 +45,7 @@ def test_a_file_of_weights_says_what_it_was_trained_with(metadata, settings, tmp
 
 @pytest.mark.parametrize(
     "metadata",
-    [
-        {"keep": "some"},
-        {"keep": 1.5},
-        {"keep": 10**400},
-        {"by": "best"},
-        {"keep": None},
-        {"opacity_weight": []},
-        {"opacity_weight": -(10**400)},
-    ],
+    [{"keep": 1.5}, {"keep": 10**400}, {"by": "best"}, {"opacity_weight": []}, {"opacity_weight": -(10**400)}],
 )
 def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path):
     save_refiner(network(), tmp_path / "r.safetensors", metadata)

@@ -15,7 +15,7 @@ CHECKS = (
 
 def test_every_check_passes_where_both_devices_are_the_cpu(coarse_rooms, capsys):
     with pytest.raises(SystemExit) as ended:
-        cuda.main(device="cpu", steps=4, every=80, resolution=(96, 64))
+        cuda.main(device="cpu", steps=4, every=160, resolution=(64, 48))
     lines = capsys.readouterr().out.splitlines()
     assert ended.value.code == 0, lines
     for name in CHECKS:

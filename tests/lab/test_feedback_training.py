@@ -1,6 +1,7 @@
 """Training of the feedback network."""
 
 import random
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -12,11 +13,12 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refiner
 
 
-@pytest.fixture
-def small(hollow_ball, monkeypatch) -> TrainingScene:
-    monkeypatch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,)))
-    monkeypatch.setattr(feedback_training, "RESOLUTION", (48, 27))
-    return TrainingScene.of("ball", hollow_ball, ["10%", "20%"], view_batches=1)
+@pytest.fixture(scope="module")
+def small(hollow_ball) -> Iterator[TrainingScene]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(feedback_training, "TRAINING", FeedbackTrainingSettings(steps=(6,)))
+        patch.setattr(feedback_training, "RESOLUTION", (48, 27))
+        yield TrainingScene.of("ball", hollow_ball, ["10%", "20%"], view_batches=1)
 
 
 def test_training_brings_repairs_closer(small, tmp_path):

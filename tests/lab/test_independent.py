@@ -23,7 +23,7 @@ def uneven(room: Gaussians) -> Gaussians:
 
 def test_the_package_agrees_with_a_recomputation_of_its_own(tmp_path, capsys):
     ps.save(uneven(box_room(0, 300)), tmp_path / "room.ply")
-    lines = independent.main(tmp_path / "room.ply", views=5, width=64)
+    lines = independent.main(tmp_path / "room.ply", views=3, width=48)
     assert "dual-branch encoder's output" in capsys.readouterr().out
     for what, count, median, largest, kept in lines:
         # 1e-9: some thousand terms in float64, in another order; determinants have condition numbers up to 1e8
@@ -39,7 +39,7 @@ def test_the_recomputation_notices_another_definition(monkeypatch, tmp_path):
     monkeypatch.setattr(  # by standard deviations, as the package had it once
         independent, "pup_hessians", lambda scene, cameras: by_deviations(by_scales(scene, cameras), scene)
     )
-    lines = independent.main(tmp_path / "room.ply", views=5, width=64)
+    lines = independent.main(tmp_path / "room.ply", views=3, width=48)
     [score] = [line for line in lines if line[0].startswith("PUP-3DGS's score")]
     assert float(score[2]) > 0.01 and score[4] != "100, 100, 100" and len(mine.means) == 300
 

@@ -8,7 +8,7 @@ import pytest
 
 from lab.common.programs import ProgramFailed, run_measured
 
-PARENT, CHILD = 2**30, 200_000_000
+PARENT, CHILD = 2**29, 100_000_000
 """Bytes held by the process that measures, and by the one that is measured."""
 
 
@@ -42,8 +42,8 @@ def test_a_program_that_fails_is_an_error_with_what_it_said_in_one_line(command,
 def test_a_program_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
     started = tmp_path / "started"
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {WAITS!r}, {str(started)!r}])"
-    with pytest.raises(ProgramFailed, match="took more than 3 s and was ended"):
-        run_measured(python(code), timeout=3)
+    with pytest.raises(ProgramFailed, match="took more than 1.5 s and was ended"):
+        run_measured(python(code), timeout=1.5)
     number = int(started.read_text())
     for _ in range(100):  # until the system has taken it away
         if not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE:

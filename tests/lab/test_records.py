@@ -30,15 +30,10 @@ def test_the_page_of_times_is_what_the_program_writes_from_the_rows():
 def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(monkeypatch, tmp_path, capsys):
     program = peer(tmp_path, "3.7.0")
     write_ply(box_room(0, 300), tmp_path / "room.ply")
-    arguments = dict(keep=(0.5, 0.1), splat_transform=program, json_path=tmp_path / "speed.json", resume=True)
+    arguments = dict(keep=(0.5,), splat_transform=program, json_path=tmp_path / "speed.json", resume=True)
     beside.main((tmp_path / "room.ply",), **arguments)
     rows = json.loads((tmp_path / "speed.json").read_text("utf-8"))["rows"]
-    assert [(row["keep"], row["method"] == beside.OURS) for row in rows] == [
-        (0.5, True),
-        (0.5, False),
-        (0.1, True),
-        (0.1, False),
-    ]
+    assert [(row["keep"], row["method"] == beside.OURS) for row in rows] == [(0.5, True), (0.5, False)]
     assert all(row["cpu_seconds"] > 0 and row["peak_bytes"] > 1e6 and row["gaussians"] == 300 for row in rows)
     first = rows[0]["cpu_seconds"], rows[1]["cpu_seconds"]
     assert f"{first[0]:.1f} / {first[1]:.1f}: {first[0] / first[1]:.2f}" in capsys.readouterr().out
@@ -48,13 +43,13 @@ def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(monkey
 
 def test_a_sweep_is_written_drawn_and_tabled(monkeypatch, tmp_path, capsys):
     few = [sweep for sweep in cases.SWEEPS if sweep.name in ("needles", "precision")]
-    few = [cases.replace(sweep, values=sweep.values[1:3]) for sweep in few]
+    few = [cases.replace(sweep, values=sweep.values[1 : 2 + (sweep.name == "precision")]) for sweep in few]
     for module in (stability, report):
         monkeypatch.setattr(module, "SWEEPS", tuple(few))
     stability.main(tmp_path, ("needles", "precision"), compiled=False)
     said = capsys.readouterr().out
     rows = json.loads((tmp_path / "stability.json").read_text())["errors"]
-    assert len(rows) > 50
+    assert len(rows) > 30
     assert {row["part"] for row in rows} == {"rasterizer", "scores", "merge", "refiner"}
     for picture in (tmp_path / "rasterizer.png", tmp_path / "others.png"):
         assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size < 200_000

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball
+from making import ball, splats
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.candidates import EVIDENCE_WEIGHT, MIN_EMPTY, Candidates
 from pointsplat_ns.looking.content import UNITS
@@ -20,14 +20,9 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 def wall(count: int = 3000, size: float = 0.06) -> Gaussians:
     """A wall of flat Gaussians at y = 2, without SH, 8 x 8 units."""
-    generator = torch.Generator().manual_seed(3)
-    flat = ball(count, 0, opacity=8.0)
-    at = 8 * torch.rand(count, 2, generator=generator) - 4
+    at = 8 * torch.rand(count, 2, generator=torch.Generator().manual_seed(3)) - 4
     means = torch.stack([at[:, 0], torch.full((count,), 2.0), at[:, 1]], dim=1)
-    scales = torch.full((count, 3), math.log(size))
-    scales[:, 1] = math.log(1e-3)
-    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4).clone()
-    return flat.replace(means=means, scales=scales, quats=quats)
+    return splats(means, [math.log(size), math.log(1e-3), math.log(size)], 8.0)
 
 
 def candidates(scene: Gaussians, step: int = 1) -> Candidates:

@@ -163,7 +163,7 @@ def test_memory_is_that_of_a_cell_and_not_of_the_scene(tmp_path):
         pytest.skip("this system does not tell the most memory that was held")
     most, sh_bytes = 5_000, 236
     rows_of(cloud(2000, seed=7), tmp_path / "few")
-    rows_of(cloud(60_000, seed=7, sh_degree=3), tmp_path / "many")
+    rows_of(cloud(35_000, seed=7, sh_degree=3), tmp_path / "many")
     command = [sys.executable, "-c", MEMORY, str(tmp_path), str(most)]  # a process of its own: no other test's memory
     grown = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     # Of a cell, 8 times as much, with what the C library and mapped files hold; of one cell for all, five times that.

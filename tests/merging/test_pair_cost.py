@@ -6,19 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import assert_same_on_any_threads, cloud
+from making import assert_same_on_any_threads, cloud, splats
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.merging import MERGING
 from pointsplat_ns.merging import covariance as algebra
-from pointsplat_ns.merging.covariance import (
-    covariances,
-    overlap,
-    plane_axes,
-    projected,
-    projected_area,
-    rms_area,
-)
+from pointsplat_ns.merging.covariance import covariances, overlap, plane_axes, projected, projected_area, rms_area
 from pointsplat_ns.merging.pair_cost import DIRECTIONS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
 from pointsplat_ns.merging.state import Participants, State, initial_state
 from pointsplat_ns.system.kernels import KERNELS
@@ -38,14 +31,9 @@ def state_of(scene: Gaussians, size: float = 1.0) -> State:
 def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians:
     """Two overlapping disks in the plane z = 0, with opacities of these logits."""
     g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.tensor([[0.0, 0, 0], [0.08, 0.03, 0]]),
-        scales=torch.tensor([[-3.0, -2.6, -9.0], [-2.7, -3.2, -9.0]]),
-        quats=torch.tensor([[1.0, 0, 0, 0.2], [1.0, 0, 0, -0.4]]),
-        opacities=torch.tensor(logits)[:, None],
-        features_dc=torch.randn(2, 3, generator=g),
-        features_rest=torch.zeros(2, 0, 3),
-    )
+    means, scales = torch.tensor([[0.0, 0, 0], [0.08, 0.03, 0]]), [[-3.0, -2.6, -9.0], [-2.7, -3.2, -9.0]]
+    colours, quats = torch.randn(2, 3, generator=g), [[1.0, 0, 0, 0.2], [1.0, 0, 0, -0.4]]
+    return splats(means, scales, torch.tensor(logits)[:, None], colours, quats)
 
 
 def cost_along_z(scene: Gaussians) -> float:

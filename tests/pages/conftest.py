@@ -11,8 +11,8 @@ from room_views import room_views
 
 @pytest.fixture(scope="session")
 def rooms() -> list[Gaussians]:
-    """The example room with a tenth of its Gaussians, and with a fiftieth."""
-    return [ps.example_room()[::10], ps.example_room()[::50]]
+    """The example room with a twentieth of its Gaussians, and with a hundredth."""
+    return [ps.example_room()[::20], ps.example_room()[::100]]
 
 
 @pytest.fixture(scope="session")

@@ -39,14 +39,11 @@ def test_levels_of_a_stream_stand_for_their_shares_and_are_not_merged(scene, tmp
     made.close(5.0)
 
 
-@pytest.mark.parametrize("percent", [1, 10, 77, 99])
-def test_a_share_is_there_at_once_by_coverage(levels, scene, percent):
-    level = levels.at(percent)
-    assert same(level.scene, ps.prune(scene, percent / 100, by="coverage"))
-    assert level.how == "chosen by coverage" and levels.ready(percent) is None
-
-
-def test_a_share_that_is_waited_for_is_merged_as_prune_does(levels, scene):
+def test_a_share_is_there_at_once_by_coverage_and_then_merged(levels, scene):
+    for percent in (1, 20):
+        level = levels.at(percent)
+        assert same(level.scene, ps.prune(scene, percent / 100, by="coverage"))
+        assert level.how == "chosen by coverage" and levels.ready(percent) is None
     assert same(levels.merged(20).scene, ps.prune(scene, "20%"))
     assert levels.at(20) is levels.ready(20) and levels.at(20).how == "merged"
     assert same(levels.at(100).scene, scene) and levels.merged(100) is levels.whole

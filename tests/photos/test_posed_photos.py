@@ -1,7 +1,6 @@
 """Photos in a folder with the poses of a file of cameras: found, brought into the scene's frame, split and checked."""
 
 import json
-import logging
 import re
 from dataclasses import replace
 
@@ -17,17 +16,12 @@ from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
-from pointsplat_ns.looking import photo_frame as module
 from pointsplat_ns.looking.poses import look_at, views_of
+from pointsplat_ns.photos import frame as module
 from pointsplat_ns.photos.posed_photos import read_posed_photos
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, write_photos
 
 COUNT = 18
-
-
-@pytest.fixture(scope="module")
-def scene() -> ps.Gaussians:
-    return ball(500)
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +33,6 @@ def views() -> ps.Views:
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
-
-
-@pytest.fixture()
-def said(caplog) -> pytest.LogCaptureFixture:
-    caplog.set_level(logging.INFO, logger="pointsplat_ns")
-    return caplog
 
 
 def moved(views: ps.Views, turn: torch.Tensor | None = None, scale: float = 1.0, flipped: bool = False) -> ps.Views:
@@ -258,8 +246,8 @@ def test_any_scene_is_compacted_with_its_photos(how, scene, views, tmp_path, sai
         assert len(ps.load(tmp_path / "small.ply")) == 250
 
 
-@pytest.mark.parametrize("how", ["python", "prune", "tradeoff"])
-def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, said, capsys):
+@pytest.mark.parametrize("how", ["prune", "tradeoff"])
+def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, capsys):
     shown = scene.replace(features_dc=scene.features_dc + 0.3) if how == "tradeoff" else scene
     folder, model = write_photos(shown, views, tmp_path / "images"), write_colmap_binary(views, tmp_path / "model")
     path = tmp_path / "room.ply"
@@ -273,12 +261,8 @@ def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, 
         command = sweep["points"][2]["command"]
         assert f"--photos {folder}" in command and f"--poses {model}" in command
         return
-    if how == "python":
-        ps.prune(scene, "50%", photos=folder, views=model)
-    else:
-        main(["prune", str(path), *words, "-o", str(tmp_path / "small.ply")])
-    text = said.text if how == "python" else capsys.readouterr().out
-    pruned, dense = map(float, re.search(TEXT.replace(r"([\d.]+) -> ", ""), text).groups())
+    main(["prune", str(path), *words, "-o", str(tmp_path / "small.ply")])
+    pruned, dense = map(float, re.search(TEXT.replace(r"([\d.]+) -> ", ""), capsys.readouterr().out).groups())
     assert dense > pruned + 1
 
 

@@ -11,10 +11,9 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, ball, cloud, run_of, views_from_within
+from making import SHARED_DATA, cloud, run_of, views_from_within
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.camera_files import read_named_views
 from pointsplat_ns.io.turning import Similarity
@@ -22,11 +21,6 @@ from pointsplat_ns.looking.upright import axis_named
 from pointsplat_ns.photos.posed_scene import PosesFile, read_posed
 from pointsplat_ns.placing import run_frame
 from posing import inria, nerfstudio, write_colmap_text, write_photos, written
-
-
-@pytest.fixture(scope="module")
-def scene() -> Gaussians:
-    return ball(500)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Files of cameras that lie beside a scene: which are used, which are not, and what is said."""
 
 import json
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,26 +8,15 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, run_of
+from making import run_of
 from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
 from posing import inria, nerfstudio, write_colmap_text, write_photos
 
 
 @pytest.fixture(scope="module")
-def scene() -> ps.Gaussians:
-    return ball(500)
-
-
-@pytest.fixture(scope="module")
 def views(scene) -> ps.Views:
     return ps.sample_views(scene, 6, 64, 48)
-
-
-@pytest.fixture()
-def said(caplog) -> pytest.LogCaptureFixture:
-    caplog.set_level(logging.INFO, logger="pointsplat_ns")
-    return caplog
 
 
 def known(path: Path, poses: str | None = None) -> ps.Views | None:

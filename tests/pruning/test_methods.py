@@ -221,7 +221,7 @@ def test_a_typed_budget_that_is_none_is_refused(text):
         parse_keep(text)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.integers(1, 10**7), st.integers(0, 3), st.floats(0.002, 3000))
 def test_a_size_keeps_as_many_as_fit_and_not_one_more(n, degree, megabytes):
     k = resolve_keep(n, Megabytes(megabytes), degree)

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from making import normal_scene
+from making import normal_scene, splats
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
@@ -120,7 +120,7 @@ values = st.one_of(
 )  # few values, so that ties are common
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.lists(values, max_size=30).flatmap(lambda x: st.tuples(st.just(x), st.integers(0, len(x)))))
 def test_select_is_its_definition(case):
     scores, k = case
@@ -132,18 +132,6 @@ def test_select_is_its_definition(case):
 def test_more_or_fewer_than_there_are_is_said(k):
     with pytest.raises(BudgetError, match=f"cannot select {k} of 5 Gaussians; expected 0 to 5"):
         select(torch.zeros(5), k)
-
-
-def scene_at(means, log_scales=-3.0, logits=1.0):
-    n = len(means)
-    return Gaussians(
-        means=means,
-        scales=torch.as_tensor(log_scales).expand(n).reshape(n, 1).repeat(1, 3).float(),
-        quats=torch.ones(n, 4),
-        opacities=torch.as_tensor(logits).expand(n).reshape(n, 1).clone().float(),
-        features_dc=torch.zeros(n, 3),
-        features_rest=torch.zeros(n, 0, 3),
-    )
 
 
 def shares_by_definition(masses, run, first):
@@ -161,7 +149,7 @@ def shares_by_definition(masses, run, first):
     return result
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, 3.0, 700.0]), max_size=40), st.integers(1, 7), st.data())
 def test_mass_shares_are_their_definition(masses, run, data):
     first = data.draw(st.integers(0, run - 1))
@@ -178,7 +166,7 @@ def test_no_region_is_emptied_at_ten_percent_where_other_scores_empty_one():
     small = torch.rand(1600, 3, generator=generator) * torch.tensor([0.0, 1.0, 1.0]) + torch.tensor([1.0, 0.0, 0.0])
     scales = torch.cat([torch.full((400,), -2.0), torch.full((1600,), -5.0)])
     logits = torch.cat([torch.full((400,), 2.0), torch.full((1600,), -1.0)]) + torch.randn(2000, generator=generator)
-    scene = scene_at(torch.cat([big, small]), scales, logits)
+    scene = splats(torch.cat([big, small]), scales[:, None], logits[:, None])
     cell = (scene.means[:, 0] > 0.5) * 16 + (scene.means[:, 1] * 4).long().clamp_max(3) * 4
     cell = cell + (scene.means[:, 2] * 4).long().clamp_max(3)
     kept = {by: select(score_of(scene, METHODS[by]), 200) for by in ("coverage", "paper")}

@@ -13,7 +13,6 @@ from safetensors.torch import load_file, save_file
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.refiner import (
-    PRESETS,
     Refiner,
     RefinerConfigError,
     WeightsError,
@@ -178,12 +177,6 @@ def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
         (read_refiner if key == "config" else read_metadata)(path)
 
 
-@pytest.mark.parametrize("size", PRESETS)
-def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
-    said = re.search(rf"``{size}``.*?([\d,]+) parameters", preset.__doc__, re.S).group(1)
-    assert sum(p.numel() for p in Refiner(preset(size)).parameters()) == int(said.replace(",", ""))
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -191,15 +184,12 @@ def test_presets_have_the_parameter_counts_that_their_docstring_says(size):
         ({"dec_heads": (5, 3)}, "dec: 32 channels do not divide into 5 heads"),
         ({"strides": (2, 3)}, "strides holds 3; expected powers of two"),
         ({"curves": ("z", "peano")}, "expected z, z-trans"),
-        ({"curves": ()}, "curves is (); expected z"),
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"grid": 1000}, "grid is 1000"),
         ({"encoder": "single"}, "encoder is 'single'"),
         ({"encoder": "concat", "use_appearance": False}, "encoder 'concat' expects both on"),
-        ({"encoder": "concat", "use_position": False}, "encoder 'concat' expects both on"),
         ({"norm": "group"}, "norm is 'group'"),
         ({"patch": 0}, "patch is 0"),
-        ({"drop_path": 1.0}, "drop_path is 1.0"),
         ({"head_depth": 1}, "head_depth is 1"),
     ],
 )

@@ -5,7 +5,6 @@ import ast
 import itertools
 import math
 import os
-import shlex
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.system.kernels import on_threads
 from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.views import Views
 
@@ -72,24 +70,21 @@ def assert_same_on_any_threads(function: Callable[[], Sequence[torch.Tensor]]) -
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
-def record_kernels(monkeypatch, *modules) -> list:
-    """The kernels that modules of ``pointsplat_ns.rasterizer.compiled`` call from now on, as a list that grows."""
-    called: list = []
-
-    def recorded(worth_it, function, *arguments):
-        called.append(function)
-        on_threads(worth_it, function, *arguments)
-
-    for module in modules:
-        monkeypatch.setattr(module, "on_threads", recorded)
-    return called
-
-
 def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
     """A scene whose every parameter is drawn from the standard normal distribution."""
     generator = torch.Generator().manual_seed(seed)
     shapes = [(n, 3), (n, 3), (n, 4), (n, 1), (n, 3), (n, (degree + 1) ** 2 - 1, 3)]
     return Gaussians(*(torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes))
+
+
+def splats(means: torch.Tensor, scales, logits, colours=0.0, quats=(1.0, 0.0, 0.0, 0.0), degree: int = 0) -> Gaussians:
+    """Gaussians at ``means`` (N, 3), without SH. What else they have is a number or a row for all, or one for each."""
+    n = len(means)
+    scales, logits, colours, quats = (
+        torch.as_tensor(value).to(means.dtype).expand(n, width).clone()
+        for value, width in ((scales, 3), (logits, 1), (colours, 3), (quats, 4))
+    )
+    return Gaussians(means, scales, quats, logits, colours, means.new_zeros(n, (degree + 1) ** 2 - 1, 3))
 
 
 def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
@@ -148,14 +143,8 @@ def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = Fal
     rows, axis = torch.arange(count), torch.arange(count) % 3
     means[rows, axis] = torch.sign(means[rows, axis])
     phase = torch.randn(3 if smooth else (count, 3), generator=generator)
-    return Gaussians(
-        means=means * torch.tensor([2.0, 1.5, 1.0]),
-        scales=torch.full((count, 3), size).log(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        opacities=torch.full((count, 1), 4.0),
-        features_dc=torch.sin(2 * means + phase) if smooth else phase,
-        features_rest=torch.zeros(count, 3, 3),
-    )
+    colours = torch.sin(2 * means + phase) if smooth else phase
+    return splats(means * torch.tensor([2.0, 1.5, 1.0]), torch.tensor(size).log(), 4.0, colours, degree=1)
 
 
 def splats_in_view(
@@ -190,18 +179,6 @@ def camera_askew(
     view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
     view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
     return view, K
-
-
-def scene_to_refine(n: int = 200, sh_degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """Small blobs, uniform in a cube of side 4."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def randn(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    means = torch.rand(n, 3, generator=generator, dtype=torch.float64).to(dtype) * 4
-    rest = (sh_degree + 1) ** 2 - 1
-    return Gaussians(means, randn(n, 3) - 4, randn(n, 4), randn(n, 1) * 2, randn(n, 3), randn(n, rest, 3) * 0.1)
 
 
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
@@ -303,20 +280,6 @@ def without_data(runs: Path, folder: Path) -> Path:
     for config in folder.rglob("config.yml"):
         config.write_text(config.read_text().replace("- replica", "- gone_from_here"))
     return folder
-
-
-def parsed_by_ns_train(command: str):
-    """The config that ns-train makes of a command line."""
-    import tyro
-
-    from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
-
-    import_nerfstudio()
-    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-    program, *words = shlex.split(command)
-    assert program == "ns-train"
-    return tyro.cli(AnnotatedBaseConfigUnion, args=words)
 
 
 def noisy_pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:

@@ -3,6 +3,7 @@
 import torch
 from scipy.spatial.transform import Rotation
 
+from making import splats
 from pointsplat_ns.gaussians import Gaussians
 
 TURNS = [Rotation.identity(), *(Rotation.random(random_state=seed) for seed in range(4))]
@@ -18,10 +19,7 @@ def plates(*faces: tuple[tuple[float, float, float], tuple[float, float, float]]
         share = 2 * torch.rand(count, 3, generator=generator) - 1
         means.append(torch.tensor(middle) + share * torch.tensor(half))
         scales.append(torch.tensor([0.1 if side else 0.005 for side in half]).log().expand(count, 3))
-    n = sum(map(len, means))
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-    grey = torch.zeros(n, 3)
-    return Gaussians(torch.cat(means), torch.cat(scales), identity, torch.full((n, 1), 4.0), grey, torch.zeros(n, 0, 3))
+    return splats(torch.cat(means), torch.cat(scales), 4.0)
 
 
 def room() -> Gaussians:

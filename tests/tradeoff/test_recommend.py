@@ -41,18 +41,6 @@ def test_the_expected_loss_is_that_of_independent_errors():
     assert lost == pytest.approx(expected_loss(float(ps.psnr(small, dense))), abs=0.02)
 
 
-def test_the_fastest_within_the_loss_is_recommended_not_the_smallest():
-    dense, slow, fast = (point(*some) for some in (
-        ("dense", 100, math.inf, None, 1000), ("slow", 30, 40.0, None, 500), ("fast", 20, 37.0, None, 900),
-    ))  # fmt: skip
-    best, why = recommend([dense, slow, fast, point("poor", 5, 20.0, None, 100)], 0.5)
-    limit = "has at least 36.1 dB against the dense scene's renders (about 0.5 dB lost against photos): "
-    assert best is fast and why.startswith(f"the fastest point that {limit}the fast, 900 Gaussians")
-    assert "20 ms a frame in place of 100" in why
-    best, why = recommend([dense, fast, slow], 0.5, trusted=False)
-    assert best is slow and why.startswith(f"the point with the fewest Gaussians that {limit}") and "ms" not in why
-
-
 @pytest.mark.parametrize("photos, loss", [((30.0, 25.0, 27.75), "2.25 dB:"), ((None,) * 3, "1.76 dB (estimated):")])
 def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     settings = ("dense", 100, math.inf, photos[0], 500), ("poor", 5, 20.0, photos[1], 1), ("b", 50, 30.0, photos[2], 90)
@@ -63,6 +51,9 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
     assert f"; the next best, the b, loses {loss} 90 Gaussians, 0.900 kB in place of 5.00 kB, " in why
     assert "50 ms a frame in place of 100, made in 3 s" in why
     assert "next best" not in recommend([dense], 0.5)[1]
+    for trusted, what in ((True, "the fastest point that"), (False, "the point with the fewest Gaussians that")):
+        best, why = recommend([dense, poor, other], 2.5, trusted)
+        assert best is other and why.startswith(f"{what} ") and (" ms" in why) == trusted
 
 
 def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):

@@ -10,9 +10,9 @@ import pointsplat_ns as ps
 from lab.tables import figures, networks
 from lab.tables.networks import jobs
 from lab.tables.ways import WAYS
-from making import box_room, parsed_by_ns_train
+from making import box_room, write_run
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.refiner import Refiner, preset, read_metadata
+from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
 
 NUMBER = {job.name: f"{number}/16" for number, job in enumerate(jobs(), 1)}
@@ -37,12 +37,6 @@ def written(command: str, log: Path) -> None:
     save_refiner(network, folder / "refiner.safetensors", known)
 
 
-def test_there_are_sixteen_networks_and_seeds_are_of_table_4():
-    assert len(NUMBER) == 16 and len({job.name for job in jobs(3)}) == 16 + 2 * 4
-    assert {job.way.name for job in jobs(2)[16:]} == {"pointsplat", "pointsplat-ii", "pointsplat-iii", "pointsplat-iv"}
-    assert {job.share for job in jobs() if job.way == WAYS.splatformer} == {0.5, 0.3, 0.1}
-
-
 @pytest.fixture()
 def small(trained_walls, tmp_path, no_lpips):
     """A function that trains networks of size tiny for three steps, never on wall-b."""
@@ -54,30 +48,17 @@ def small(trained_walls, tmp_path, no_lpips):
     return train
 
 
-def test_an_interrupted_training_goes_on_where_it_was(small, run_training, tmp_path, monkeypatch):
+def test_an_interrupted_training_goes_on_where_it_was(small, tmp_path, monkeypatch):
     asked = []
-
-    def train(command: str, log: Path) -> None:
-        config = parsed_by_ns_train(command)
-        config.pipeline.datamanager.data = config.data
-        asked.append((config.max_num_iterations, config.load_dir))
-        if len(asked) == 1:  # stopped after two steps, as by Ctrl-C: with a checkpoint, without weights
-            config.max_num_iterations = 2
-        run_training(config)
-        if len(asked) == 1:
-            (config.get_base_dir() / "refiner.safetensors").unlink()
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(networks, "run", train)
-    with pytest.raises(KeyboardInterrupt):
-        small(shard=NUMBER["pointsplat-iii-10"])
-    small(shard=NUMBER["pointsplat-iii-10"])
-    small(shard=NUMBER["pointsplat-iii-10"])  # which finds it finished
+    monkeypatch.setattr(networks, "run", lambda command, log: asked.append(shlex.split(command)))
     folder = tmp_path / "networks" / "pointsplat-iii-10" / "pointsplat" / "run"
-    assert asked == [(3, None), (1, folder / "nerfstudio_models")]
-    known = read_metadata(folder / "refiner.safetensors")
-    assert (known["steps"], known["scenes"], known["size"]) == (3, "wall-a", "tiny")
-    assert (known["by"], known["keep"], known["pixel_loss"]) == ("paper", 0.1, "rmse")
+    write_run(folder, 2, 5)
+    small(shard=NUMBER["pointsplat-iii-10"], steps=5)
+    options = dict(zip(asked[0], asked[0][1:], strict=False))
+    assert (options["--max-num-iterations"], options["--load-dir"]) == ("3", str(folder / "nerfstudio_models"))
+    (folder / "refiner.safetensors").touch()
+    small(shard=NUMBER["pointsplat-iii-10"])
+    assert len(asked) == 1, "it is finished"
 
 
 def test_networks_fill_all_rows_and_all_figures(small, room, measured, tmp_path, monkeypatch):

@@ -1,21 +1,10 @@
 """Ways of a table."""
 
-import shlex
-
 import pytest
 
 import pointsplat_ns as ps
 from lab.common.ways import SplatTransform
-from lab.tables.ways import PROTOCOL, WAYS, cell_key
 from making import box_room
-
-CELLS = WAYS.cells(PROTOCOL.shares)
-
-
-def test_no_two_cells_have_one_name_and_a_shell_reads_each_as_it_is():
-    keys = [cell_key("fox", way, share) for way, share in CELLS]
-    assert len(set(keys)) == len(keys) and shlex.split(" ".join(keys)) == keys
-    assert "fox/merge/10%" in keys and "fox/dense/100%" in keys
 
 
 def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
