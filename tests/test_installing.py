@@ -54,15 +54,14 @@ timestamp: run
 
 RUNS = {
     "--version": "pointsplat-ns",
-    "info room.ply": "600 Gaussians",
-    "prune room.ply --keep 10%": "merged to 60 of 600",
+    "info room.ply": "200 Gaussians",
+    "prune room.ply --keep 10%": "merged to 20 of 200",
     "compact room.ply --keep 30% --effort instant --html small.html": "small.html",
-    "lod room.ply --levels 30%": "1 level of 600 Gaussians",
+    "lod room.ply --levels 30%": "1 level of 200 Gaussians",
     "tradeoff room.ply --keep 10% --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
-    "convert room.ply room.spz": "600 Gaussians",
-    "convert room.ply room.sog": "600 Gaussians",
-    "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.2": "5 frames",
-    "export run -o exported.ply": "300 Gaussians",
+    "convert room.ply room.sog": "200 Gaussians",
+    "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.1 --fps 20": "2 frames",
+    "export run -o exported.ply": "100 Gaussians",
     "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",
 }
 """Commands that nothing is missing for, and what they print."""
@@ -103,11 +102,11 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
             if not (packages / top).exists():
                 (packages / top).symlink_to(distribution.locate_file(top))
 
-    ps.save(ps.prune(ps.example_room(), 600, by="coverage"), work / "room.ply")
+    ps.save(ps.prune(ps.example_room(), 200, by="coverage"), work / "room.ply")
     (work / "photos").mkdir()
     (work / "run" / "nerfstudio_models").mkdir(parents=True)
     (work / "run" / "config.yml").write_text(RUN_CONFIG)
-    scene = ps.load(work / "room.ply")[:300]
+    scene = ps.load(work / "room.ply")[:100]
     content = {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in scene.items()}}
     torch.save(content, work / "run" / "nerfstudio_models" / "step-000000009.ckpt")
 

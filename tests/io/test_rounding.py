@@ -16,12 +16,10 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
-from pointsplat_ns.io.formats import format_to_write, spz
+from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of
-from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounding_for, steps_of
 from pointsplat_ns.merging.covariance import covariances, unpack
-from pointsplat_ns.rasterizer import render
 
 SILENT = lambda *told: None  # noqa: E731
 
@@ -88,21 +86,6 @@ def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
         assert second == pytest.approx(first, rel=0.01)  # written anew, nothing is rounded further
         sizes.append(first)
     assert sizes[0] > 1.1 * sizes[1] > 1.1**2 * sizes[2]
-
-
-def test_a_tolerance_beats_fewer_bits_for_all(tmp_path, monkeypatch):
-    room = ps.example_room()[::4]
-    views = ps.sample_views(room, 4, width=160, height=120)
-
-    def written(data: bytes) -> tuple[int, float]:
-        (tmp_path / "a.spz").write_bytes(data)
-        scene = ps.load(tmp_path / "a.spz")
-        return len(data), sum(float((render(scene, view) - render(room, view)).square().mean()) for view in views)
-
-    smaller, less = written(encode_spz(rounded(room, Rounding(0.007))))
-    monkeypatch.setattr(spz, "SH_BITS", (3, 3))
-    size, error = written(encode_spz(room))
-    assert smaller < size and less < error
 
 
 def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):

@@ -108,9 +108,8 @@ def test_splat_transform_reads_every_level(folder, tmp_path):
         pytest.skip("no splat-transform on the path, so nothing else reads the stream")
     for level, count in enumerate((FINE, COARSE)):
         out = tmp_path / f"{level}.ply"
-        subprocess.run(
-            [program, "-w", "-L", str(level), folder / "lod-meta.json", out], check=True, capture_output=True
-        )
+        words = [program, "-w", "-L", str(level), folder / "lod-meta.json", out]
+        subprocess.run(words, check=True, capture_output=True)
         assert torch.allclose(ps.load(out).means, read_sog_stream(folder, level).means, atol=1e-5)
         assert len(ps.load(out)) == count
 

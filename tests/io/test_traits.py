@@ -74,13 +74,6 @@ def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
     assert ps.load(tmp_path / "4.spz").antialiased
 
 
-def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, caplog):
-    ps.save(cloud(3, sh_degree=0), tmp_path / "a.splat")
-    assert not caplog.text
-    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / "a.splat", overwrite=True)
-    assert "the mark of antialiased training; .sog keeps it" in caplog.text
-
-
 def test_traits_stay_on_every_way_through_the_package():
     scene = trained_so(ball(400, 1)).replace(up="-x")
     half = scene[:200]

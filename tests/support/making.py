@@ -123,6 +123,13 @@ def ball(
     )
 
 
+class Bomb:
+    """An object that prints when it is unpickled as usual."""
+
+    def __reduce__(self):
+        return (print, ("this must never be printed",))
+
+
 EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])
 """Where photos of :func:`photographed` were taken."""
 
