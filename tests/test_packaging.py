@@ -34,7 +34,6 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 def tracked_files() -> list[str]:
-    """What git tracks and is there, relative to the root."""
     try:
         listed = subprocess.run(
             ["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=True
@@ -46,7 +45,6 @@ def tracked_files() -> list[str]:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of the sdist of the tracked files."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
     for name in tracked_files():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -58,8 +56,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Installed(NamedTuple):
-    """The package in an environment of its own."""
-
     environment: Path
     folder: Path  # with a small room.ply, to work in
     python: Path
@@ -68,7 +64,6 @@ class Installed(NamedTuple):
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The package, installed from the wheel."""
     folder = tmp_path_factory.mktemp("installed")
     environment = folder / "environment"
     run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=folder)
@@ -131,7 +126,6 @@ PACKAGE = REPOSITORY / "pointsplat_ns"
 
 
 def modules_after(code: str) -> set[str]:
-    """The modules that code imports into a fresh Python."""
     words = f"import sys, json; before = set(sys.modules)\n{code}\nprint(json.dumps(sorted(set(sys.modules) - before)))"
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr

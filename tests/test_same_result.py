@@ -18,7 +18,6 @@ FORMATS = ("ply", "spz", "sog", "splat")
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Within, torch computes on that many threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

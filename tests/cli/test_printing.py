@@ -28,8 +28,6 @@ def ply(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture()
 def as_json(capsys):
-    """A function that runs a command with --json and gives what it printed."""
-
     def run(*words: object) -> dict:
         main([*map(str, words), "--json"])
         return json.loads(capsys.readouterr().out)

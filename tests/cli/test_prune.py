@@ -104,7 +104,6 @@ def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named,
 
 @pytest.fixture()
 def posed(tmp_path) -> tuple[Path, Path]:
-    """A room, and a file of cameras in it."""
     scene = ball(300, opacity=1.0, bright=1.0)
     write_ply(scene, tmp_path / "room.ply")
     return tmp_path / "room.ply", written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")

@@ -40,7 +40,6 @@ def saved_by_nerfstudio(scene, step=29999, prefix="_model.gauss_params."):
 
 @pytest.fixture
 def checkpoint_of():
-    """``checkpoint_of(scene, step, prefix)``: what nerfstudio's trainer saves of it."""
     return saved_by_nerfstudio
 
 
@@ -63,8 +62,6 @@ def config_texts():
 
 @pytest.fixture
 def make_run(tmp_path, config_texts):
-    """A function that lays out a run below ``tmp_path`` and returns its folder."""
-
     def make(experiment="kitchen", method="splatfacto", time="2024-05-06_070809", steps=(1999,), scene=None):
         folder = tmp_path / "outputs" / experiment / method / time
         (folder / "nerfstudio_models").mkdir(parents=True)

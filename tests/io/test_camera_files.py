@@ -23,7 +23,6 @@ SEED = 3
 
 
 def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
-    """Cameras that stand and look anywhere."""
     generator = torch.Generator().manual_seed(SEED)
     turns = rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64))
     places = torch.randn(count, 3, 1, generator=generator, dtype=torch.float64)

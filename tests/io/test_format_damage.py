@@ -66,7 +66,6 @@ def test_a_garbled_file_is_read_or_refused_in_one_line(tmp_path, name, data):
 
 
 def most_memory(path):
-    """Bytes at the peak while a file is read or refused."""
     tracemalloc.start()
     try:
         refused(path)

@@ -39,7 +39,6 @@ def psnr_of_file(scene, path, unit=1.0):
 
 
 def loss_text(caplog):
-    """The one warning of a loss, or nothing."""
     found = [record.getMessage() for record in caplog.records if "lost in" in record.getMessage()]
     assert len(found) <= 1
     return found[0] if found else ""

@@ -164,7 +164,6 @@ def test_a_photo_is_turned_by_exif_where_its_camera_is(tmp_path):
 
 
 def png_of(width: int, height: int) -> bytes:
-    """The beginning of a PNG of any size."""
     head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     data = struct.pack(">I", 1000) + b"IDAT"
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head)) + data

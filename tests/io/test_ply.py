@@ -23,7 +23,6 @@ def rows_of(path):
 
 
 def rewrite(path, rows, **kwargs):
-    """The file again, by plyfile itself."""
     PlyData([PlyElement.describe(rows, "vertex")], **kwargs).write(str(path))
 
 

@@ -25,7 +25,6 @@ SILENT = lambda *told: None  # noqa: E731
 
 
 def one() -> Gaussians:
-    """A Gaussian twice as long as wide, at the origin."""
     return Gaussians(
         means=torch.zeros(1, 3),
         scales=torch.tensor([[0.2, 0.1, 0.1]]).log(),
@@ -118,17 +117,9 @@ def test_rows_are_refused_as_whole_files_are_and_when_a_file_shrinks(tmp_path):
 
 
 def rows_of(n, dims, seed=0):
-    """Rows about 300 centres, as real SH are about few."""
     generator = torch.Generator().manual_seed(seed)
     centres = torch.randn(300, dims, generator=generator)
     return centres[torch.randint(300, (n,), generator=generator)] + 0.01 * torch.randn(n, dims, generator=generator)
-
-
-@pytest.mark.parametrize("values", [torch.zeros(5), torch.tensor([1.0]), torch.linspace(-3, 3, 256)])
-def test_a_codebook_of_few_numbers_is_exact(values):
-    book, index = codebook(values)
-    assert book.shape == (256,) and index.dtype == torch.uint8
-    assert torch.allclose(book[index.long()], values, atol=1e-6)
 
 
 @pytest.mark.parametrize("different", [1, 300, 700])

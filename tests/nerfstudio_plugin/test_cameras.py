@@ -28,7 +28,6 @@ BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
 def some_cameras(num: int = 3) -> Cameras:
-    """Turned and moved at random, off-centre, with unequal focal lengths."""
     generator = torch.Generator().manual_seed(SEED)
     turn = torch.linalg.qr(torch.randn(num, 3, 3, generator=generator))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
@@ -107,7 +106,6 @@ def run(trained_walls) -> Path:
 
 
 def mean_psnr(scene: Gaussians, run: Path) -> float:
-    """In the held-out photos of a run, dB."""
     photos = run_photos(run, "test")
     errors = [ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos]
     return float(torch.stack(errors).mean())

@@ -27,8 +27,6 @@ FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5
 
 @dataclass
 class Layout:
-    """How a capture is laid out, and what reads it."""
-
     lens: Lens
     write: Callable[[Capture, Path], Path]
     dataparser: Callable[[], DataParserConfig]
@@ -63,8 +61,6 @@ LAYOUTS = {
 
 @dataclass
 class Trained:
-    """A capture on which splatfacto-cpu was trained."""
-
     capture: Capture
     layout: Layout
     run: Path
@@ -140,7 +136,6 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def own_scene(scene, tmp_path) -> Path:
-    """A copy to change."""
     return Path(shutil.copytree(scene, tmp_path / "scene"))
 
 

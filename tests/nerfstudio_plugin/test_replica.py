@@ -17,7 +17,6 @@ from replica_scenes import CAMERA, line_of, write_scene
 
 @pytest.fixture()
 def row(tmp_path):
-    """Twelve frames, a unit apart."""
     return write_scene(tmp_path / "room", frames=12, step=1.0)
 
 

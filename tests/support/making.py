@@ -29,10 +29,14 @@ SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
 
 
+QUICK_START = REPOSITORY / "tests" / "support" / "quick_start"
+"""First on the path of programs of nerfstudio that need not list the methods of others."""
+
+
 def quick_start() -> dict[str, str]:
     """The environment, for programs of nerfstudio that need not list the methods of others."""
-    paths = [str(REPOSITORY / "tests" / "support" / "quick_start"), os.environ.get("PYTHONPATH", "")]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    paths = filter(None, (str(QUICK_START), os.environ.get("PYTHONPATH")))
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def imports_of(path: Path) -> set[str]:

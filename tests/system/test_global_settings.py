@@ -89,7 +89,6 @@ def plain(value: Any) -> Any:
 
 
 def results_of(scene: Path, folder: Path) -> dict[str, Any]:
-    """What the public functions give for a scene's file."""
     room = ps.load(scene)
     views = ps.sample_views(room, 3, width=48, height=36)
     image, other = ps.render(room, views[0]), ps.render(room[:100], views[0])

@@ -38,14 +38,12 @@ def trained(trained_walls, run_training, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def evaluated(trained):
-    """The pipeline as ns-eval opens it."""
     config, _, _ = trained
     return eval_setup(config.get_base_dir() / "config.yml")[1]
 
 
 @pytest.fixture(scope="session")
 def three_rooms(tmp_path_factory) -> Path:
-    """A folder of three PLY files and nothing else."""
     folder = tmp_path_factory.mktemp("three_rooms")
     for seed in range(3):
         write_ply(box_room(seed, size=0.12, smooth=True), folder / f"room{seed}.ply")

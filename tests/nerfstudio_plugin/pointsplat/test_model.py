@@ -89,10 +89,19 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
         ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
         ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
+        ({"schedule": "step", "drop_at": 0.0}, "--drop-at 0"),
+        ({"global_norm": 0.0}, "--global-norm 0"),
+        ({"global_norm": math.nan}, "--global-norm nan"),
+        ({"rate_factor": -1.0}, "--rate-factor"),
+        ({"rate_factor": math.inf}, "--rate-factor"),
+        ({"seconds": 0.0}, "--seconds 0: expected a finite number above 0"),
+        ({"seconds": math.nan}, "--seconds nan: expected a finite number above 0"),
     ],
 )
 def test_contradictory_settings_are_refused(trained_walls, tmp_path, changes, message):
-    config = small_config(trained_walls, tmp_path / "outputs", 1, **changes)
+    config = small_config(trained_walls, tmp_path / "outputs", 1)
+    for name, value in changes.items():
+        setattr(config if hasattr(config, name) else config.pipeline.model, name, value)
     config.save_config()
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()

@@ -15,7 +15,6 @@ from making import dense_config
 
 @pytest.fixture(scope="module")
 def trained(three_rooms, run_training, tmp_path_factory):
-    """A short training on two of the rooms: its config and trainer."""
     config = dense_config(three_rooms, tmp_path_factory.mktemp("refined"), steps=16)
     for group in config.optimizers.values():
         group["optimizer"].lr *= 10  # tests take few steps
