@@ -53,14 +53,14 @@ def test_info_of_several_files_is_a_table(scene, tmp_path, capsys):
     capsys.readouterr()
     run("info", scene, other)
     said = capsys.readouterr().out
-    for path in (scene, other):
-        found = ps.info(path)
+    infos = [ps.info(path) for path in (scene, other)]
+    for path, found in zip((scene, other), infos, strict=True):
         [row] = [line for line in said.splitlines() if str(path) in line]
         cells = [cell.strip() for cell in row.strip("│").split("│")]
         size = three_digits(found.bytes / 1e6)
         assert cells[:4] == [str(path), found.format, size, f"{found.gaussians:,}"] and cells[5] == found.up_text
     run("info", scene, other, "--json")
-    assert json.loads(capsys.readouterr().out) == [ps.info(path).as_dict() for path in (scene, other)]
+    assert json.loads(capsys.readouterr().out) == [found.as_dict() for found in infos]
     refusal(capsys, tmp_path, "info", scene, other, "--views", tmp_path / "sheet.png")
 
 

@@ -101,7 +101,6 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     repaired = compacted.repaired
     assert repaired is not None
     found["compacted"] = [compacted.scene, compacted.psnr, repaired.scene]
-    found["compacted, sampled views"] = ps.compact(room, 0.3).scene
     refiner = ps.load_refiner(folder.parent / "refiner.safetensors")
     found["refined"] = ps.refine(found["pruned by paper"], refiner)
     levels = ps.lod(room, ["50%", 60], views=views, folder=folder / "levels")
