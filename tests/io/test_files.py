@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from foreign import write_sog_folder
+from refusing import fails
 
 import pointsplat_ns as ps
 from making import cloud, normal_scene
@@ -129,13 +130,10 @@ def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, t
 
 def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_path):
     (tmp_path / "empty").mkdir()
-    for folder, said in (
-        (make_run(), "expected a folder with scenes below it"),
-        (tmp_path / "gone", "expected a folder with scenes below it"),
-        (tmp_path / "empty", "no scene below it; expected files \\(.*\\) or trained Splatfacto runs"),
-    ):
-        with pytest.raises(SceneError, match=said):
-            find_scenes(folder)
+    for folder in (make_run(), tmp_path / "gone"):
+        fails(lambda: find_scenes(folder), "expected a folder with scenes below it", error=SceneError)
+    said = ("no scene below it; expected files (", ") or trained Splatfacto runs")
+    fails(lambda: find_scenes(tmp_path / "empty"), *said, error=SceneError)
 
 
 def test_results_of_earlier_commands_are_no_scenes(tmp_path, caplog):

@@ -1,6 +1,5 @@
 """Captures of all kinds."""
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -49,10 +48,6 @@ def nerfstudio_data() -> NerfstudioDataParserConfig:
 LAYOUTS = {
     "nerfstudio-data": Layout(Lens(), Capture.write_nerfstudio, nerfstudio_data),
     "colmap": Layout(Lens(distortion=(0.12, -0.05, 0.004, -0.003)), as_colmap, ColmapDataParserConfig),
-    # With a k4, nerfstudio's parser refuses even a fisheye.
-    "colmap, fisheye": Layout(
-        dataclasses.replace(FISHEYE, distortion=(0.02, -0.01, 0.003, 0.0)), as_colmap, ColmapDataParserConfig
-    ),
     "scannetpp-seeded": Layout(
         FISHEYE, Capture.write_scannetpp, SeededScanNetppDataParserConfig, frames=FRAMES - len(BAD)
     ),
