@@ -131,7 +131,8 @@ def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, t
 def test_a_run_no_folder_and_a_folder_without_scenes_are_refused(make_run, tmp_path):
     (tmp_path / "empty").mkdir()
     for folder in (make_run(), tmp_path / "gone"):
-        fails(lambda: find_scenes(folder), "expected a folder with scenes below it", error=SceneError)
+        with pytest.raises(SceneError, match="expected a folder with scenes below it"):
+            find_scenes(folder)
     said = ("no scene below it; expected files (", ") or trained Splatfacto runs")
     fails(lambda: find_scenes(tmp_path / "empty"), *said, error=SceneError)
 
