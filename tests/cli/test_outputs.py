@@ -11,16 +11,13 @@ from making import ball
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import repair
 
-FILES = (
+FAILING = (
     "prune damaged.ply -o OUT.ply",
     "compact damaged.ply -o OUT.spz",
     "compact damaged.ply --dry-run --html OUT.html",
     "convert damaged.ply OUT.sog",
     "info damaged.ply --views OUT.png",
     "render damaged.ply -o OUT.mp4",
-)
-
-FOLDERS = (
     "lod damaged.ply -o OUT",
     "tradeoff damaged.ply -o OUT",
     "render damaged.ply -o OUT",
@@ -35,7 +32,7 @@ def here(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("words", (*FILES, *FOLDERS))
+@pytest.mark.parametrize("words", FAILING)
 def test_a_place_that_takes_no_files_is_named_before_the_scene_is_read(words, here, capsys):
     words = words.replace("OUT", "damaged.ply/OUT")
     output = next(word for word in words.split() if "OUT" in word)

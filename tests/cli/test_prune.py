@@ -102,16 +102,11 @@ def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named,
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
 
 
-@pytest.fixture()
-def posed(tmp_path) -> tuple[Path, Path]:
-    scene = ball(300, opacity=1.0, bright=1.0)
-    write_ply(scene, tmp_path / "room.ply")
-    return tmp_path / "room.ply", written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
-def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(posed, tmp_path, capsys, suffix):
-    room, poses = posed
+def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, capsys, suffix):
+    room, scene = tmp_path / "room.ply", ball(300, opacity=1.0, bright=1.0)
+    write_ply(scene, room)
+    poses = written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
     run("prune", room, "--keep", "2MB", "--poses", poses, "-o", tmp_path / f"small{suffix}")
     said = capsys.readouterr().out
     assert "nothing is merged, all 300 Gaussians fit as they are" in said
