@@ -14,7 +14,6 @@ from pointsplat_ns.errors import SceneError
 
 @pytest.fixture()
 def folder(tmp_path) -> Path:
-    """A folder of three scenes, one in a folder of its own."""
     for seed, name in enumerate(("a", "b", "deep/c")):
         ps.save(ball(60, 0, seed), tmp_path / "scenes" / f"{name}.ply")
     return tmp_path / "scenes"
@@ -35,14 +34,12 @@ def made(monkeypatch) -> list[int]:
 
 
 def settle(folder: Path, keep: str = "50%", **options) -> dict[str, ps.SceneResult]:
-    """What becomes of the scenes, by name."""
     small = folder.parent / "small"
     results = ps.compact_folder(folder, small, keep, by="opacity", effort="instant", resolution="32x24", **options)
     return {result.name: result for result in results}
 
 
 def files(folder: Path) -> set[str]:
-    """Visible and hidden files among the results."""
     small = folder.parent / "small"
     return {path.relative_to(small).as_posix() for path in small.rglob("*") if path.is_file()}
 

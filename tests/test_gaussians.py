@@ -41,6 +41,7 @@ def test_selection_takes_the_same_rows_of_every_parameter(index):
     rows = [index] if isinstance(index, int) else index
     for name, value in scene[index].items():
         assert torch.equal(value, getattr(scene, name)[rows]), name
+    assert same(scene, Gaussians.cat([scene[:2], scene[2:]]))
 
 
 def test_selecting_nothing_leaves_an_empty_scene_of_the_same_degree():
@@ -48,12 +49,6 @@ def test_selecting_nothing_leaves_an_empty_scene_of_the_same_degree():
     assert len(empty) == 0 and empty.sh_degree == 2
     assert len(Gaussians.empty(sh_degree=2)) == 0
     assert Gaussians.empty(1).usable().shape == (0,)
-
-
-def test_cat_undoes_a_split():
-    scene = normal_scene(6)
-    joined = Gaussians.cat([scene[:2], scene[2:]])
-    assert same(scene, joined)
 
 
 def test_activated_values_at_the_extremes():

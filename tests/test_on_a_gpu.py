@@ -107,34 +107,22 @@ def test_views_are_sampled_of_a_scene_on_a_gpu_as_on_the_cpu(room, views):
     assert torch.equal(found.viewmats, views.viewmats) and torch.equal(found.Ks, views.Ks)
 
 
-@pytest.fixture
-def computed_there(monkeypatch):
-    """What chooses a GPU where there is one chooses the pretended one; repairs take few steps."""
+def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, views, tmp_path, monkeypatch):
+    """What chooses a GPU where there is one chooses the pretended one."""
+    monkeypatch.setitem(STEPS, "quick", 3)
+    save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
+    wanted = ps.compact(room, 0.3, views=views)
     monkeypatch.setattr("pointsplat_ns.compression.requests.default_device", lambda: GPU)
     monkeypatch.setattr(trained_refiner, "default_device", lambda: GPU)
-    monkeypatch.setitem(STEPS, "quick", 3)
-
-
-def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, monkeypatch, request):
-    monkeypatch.setitem(STEPS, "quick", 3)
-    wanted = ps.compact(room, 0.3, resolution=(64, 48))
-    request.getfixturevalue("computed_there")
     with pretend_gpu() as gpu:
-        found = ps.compact(room, 0.3, resolution=(64, 48))
+        found = ps.compact(room, 0.3, views=views)
+        refined = ps.compact(room, 0.5, ps.load_refiner(tmp_path / "small.safetensors"), effort="instant", views=views)
     check(gpu)
     assert len(gpu.operations) > 1000, "renders, and steps of the repair"
+    assert len(refined.scene) == 200
     assert len(found.scene) == len(wanted.scene) and {stage.scene.device for stage in found.stages} == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
-
-
-def test_a_refiner_is_computed_on_a_gpu_from_one_thread(room, computed_there, tmp_path):
-    save_refiner(small_refiner(sh_degree=1), tmp_path / "small.safetensors")
-    with pretend_gpu() as gpu:
-        refiner = ps.load_refiner(tmp_path / "small.safetensors")
-        refined = ps.compact(room, 0.5, refiner, effort="instant", resolution=(64, 48))
-        assert len(refined.scene) == 200
-    check(gpu)
 
 
 @pytest.mark.parametrize("method", ["splatfacto-cpu", "pointsplat"])
@@ -144,7 +132,8 @@ def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
     def losses_on(device: torch.device) -> list[float]:
         folder = tmp_path / device.type
         if method == "pointsplat":  # scenes are sampled, pruned and drawn
-            config = dense_config(rooms, folder, steps=3)
+            config = dense_config(rooms, folder, steps=2)
+            config.pipeline.datamanager.sampled_poses = 2
             config.pipeline.model.by, config.steps_per_eval_image = "merge", 0
         else:
             config = wall_config(wall_scene, folder, 12)  # densification is in them

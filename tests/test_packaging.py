@@ -8,8 +8,8 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -17,8 +17,6 @@ import pointsplat_ns as ps
 from making import REPOSITORY, ball, imports_of
 
 pytestmark = pytest.mark.xdist_group("packaging")  # one process builds and installs for all tests of this file
-
-ROOT = Path(__file__).parents[1]
 
 CARD = "pointsplat_ns/refiner/pretrained/CARD.md"
 """Documentation that goes with the weights."""
@@ -36,46 +34,36 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 def tracked_files() -> list[str]:
-    """What git tracks and is there, relative to the root."""
     try:
-        listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        listed = subprocess.run(
+            ["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+        ).stdout
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("no git, or no checkout: which files belong to the project is not known")
-    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
+    return [name for name in listed.split("\0") if name and (REPOSITORY / name).is_file()]
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of the sdist of the tracked files."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
     for name in tracked_files():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, source / name)
+        shutil.copy(REPOSITORY / name, source / name)
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", out, cwd=source)
     assert len([*out.glob("*.tar.gz")]) == 1
     [made] = out.glob("*.whl")
     return made
 
 
-@dataclass(frozen=True)
-class Installed:
-    """The package in an environment of its own."""
-
+class Installed(NamedTuple):
     environment: Path
     folder: Path  # with a small room.ply, to work in
-
-    @property
-    def python(self) -> Path:
-        return self.environment / "bin" / "python"
-
-    @property
-    def pointsplat(self) -> Path:
-        return self.environment / "bin" / "pointsplat"
+    python: Path
+    pointsplat: Path
 
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The package, installed from the wheel."""
     folder = tmp_path_factory.mktemp("installed")
     environment = folder / "environment"
     run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=folder)
@@ -86,7 +74,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     pip = (sys.executable, "-m", "pip", "--python", environment / "bin" / "python")
     run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     ps.save(ps.prune(ps.example_room(), GAUSSIANS, by="coverage"), folder / "room.ply")
-    return Installed(environment, folder)
+    return Installed(environment, folder, environment / "bin" / "python", environment / "bin" / "pointsplat")
 
 
 def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheel):
@@ -95,7 +83,7 @@ def test_wheel_holds_every_file_of_the_packages_but_their_documentation(wheel):
     with zipfile.ZipFile(wheel) as archive:
         held = {info.filename: info.file_size for info in archive.infolist()}
     assert len(wanted) > 100
-    assert {name: held.get(name) for name in wanted} == {name: (ROOT / name).stat().st_size for name in wanted}
+    assert {name: held.get(name) for name in wanted} == {name: (REPOSITORY / name).stat().st_size for name in wanted}
 
 
 def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheel):
@@ -110,15 +98,18 @@ def test_wheel_asks_for_nerfstudio_in_an_extra_alone(wheel):
     ]
 
 
-def test_installed_package_is_the_one_imported(installed):
-    where = run(installed.python, "-c", "import pointsplat_ns; print(pointsplat_ns.__file__)", cwd=installed.folder)
-    assert Path(where.strip()).is_relative_to(installed.environment)
-
-
-@pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++"))), reason="there is no C++ compiler")
-def test_installed_kernels_are_built_and_used(installed):
-    code = "import pointsplat_ns.rasterizer, pointsplat_ns.system.kernels as k; print(repr(k.KERNELS.why_missing))"
-    assert run(installed.python, "-c", code, cwd=installed.folder).strip() == "''"
+def test_installed_package_has_kernels_and_is_found_by_nerfstudio(installed):
+    code = """
+import importlib.metadata, json, pointsplat_ns.rasterizer, pointsplat_ns.system.kernels as kernels
+groups = [importlib.metadata.entry_points(group=f"nerfstudio.{kind}_configs") for kind in ("method", "dataparser")]
+names = sorted({point.name for group in groups for point in group})
+print(json.dumps([pointsplat_ns.__file__, kernels.KERNELS.why_missing, names]))
+"""
+    where, why_missing, names = json.loads(run(installed.python, "-c", code, cwd=installed.folder))
+    assert Path(where).is_relative_to(installed.environment)
+    assert why_missing == "" or not any(map(shutil.which, ("c++", "g++")))
+    methods = ["pointsplat", "pointsplat-authors", "pointsplat-paper", "splatfacto-cpu"]
+    assert names == sorted([*methods, "replica-data", "scannetpp-seeded"])
 
 
 def test_installed_prune_makes_a_scene_small(installed):
@@ -131,32 +122,14 @@ def test_installed_compact_finds_the_refiner_that_ships(installed):
     assert len(ps.load(installed.folder / "room_compact.ply")) == GAUSSIANS // 5
 
 
-def test_installed_plugin_is_found_by_nerfstudio(installed):
-    code = (
-        "from importlib.metadata import entry_points as e;"
-        "print(sorted({p.name for g in ('method_configs', 'dataparser_configs') for p in e(group='nerfstudio.' + g)}))"
-    )
-    assert run(installed.python, "-c", code, cwd=installed.folder).strip() == str(
-        ["pointsplat", "pointsplat-authors", "pointsplat-paper", "replica-data", "scannetpp-seeded", "splatfacto-cpu"]
-    )
-
-
 PACKAGE = REPOSITORY / "pointsplat_ns"
 
 
-def said_by_python(code: str, cwd: Path = REPOSITORY) -> str:
-    """What a Python of its own prints."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=cwd)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def modules_after(code: str) -> set[str]:
-    """The modules that code imports into a fresh Python."""
-    return set(json.loads(said_by_python(f"import sys, json; before = set(sys.modules)\n{code}\n" + _PRINT)))
-
-
-_PRINT = "print(json.dumps(sorted(set(sys.modules) - before)))"
+    words = f"import sys, json; before = set(sys.modules)\n{code}\nprint(json.dumps(sorted(set(sys.modules) - before)))"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout))
 
 
 def test_importing_the_package_imports_only_the_standard_library():

@@ -8,11 +8,11 @@ from pathlib import Path
 import matplotlib.image
 import pytest
 import torch
+from refusing import refusal, run
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from html_parts import parts_of
-from making import ball, same
-from pointsplat_ns.cli import main
+from making import ball, run_of, same
 from pointsplat_ns.cli.goals import GOALS
 from pointsplat_ns.compression import pictures, quality
 from pointsplat_ns.gaussians import Gaussians
@@ -29,16 +29,6 @@ def room(n: int = 150) -> Gaussians:
     return ball(n, log_size=-1.0, opacity=1.0, bright=1.0)
 
 
-def weights(path: Path, head: str, moved: float, **metadata) -> Path:
-    """A file with a refiner that adds ``moved`` to every value of one attribute."""
-    torch.manual_seed(1)
-    refiner = Refiner(preset("tiny"))
-    with torch.no_grad():
-        [*refiner.heads.mlps[head].modules()][-1].bias.fill_(moved)
-    save_refiner(refiner, path, {"keep": 0.5, "by": "opacity", **metadata})
-    return path
-
-
 @pytest.fixture(scope="module")
 def ply(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("compact") / "room.ply"
@@ -48,23 +38,13 @@ def ply(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def helps(tmp_path_factory) -> Path:
-    return weights(tmp_path_factory.mktemp("helps") / "r.safetensors", "scales", 0.05)
-
-
-def run(*args) -> None:
-    main([str(a) for a in args])
-
-
-def refusal(capsys, output: Path, *args) -> str:
-    """The one line on stderr with which compact refuses; it prints nothing else and writes nothing."""
-    before = sorted(output.parent.rglob("*"))
-    with pytest.raises(SystemExit) as caught:
-        run("compact", *args, "-o", output)
-    said = capsys.readouterr()
-    assert caught.value.code == 1 and said.out == ""
-    assert said.err.startswith("error: ") and said.err.count("\n") == 1
-    assert sorted(output.parent.rglob("*")) == before, "partial output"
-    return said.err
+    """A file with a refiner that adds 0.05 to every log-scale."""
+    torch.manual_seed(1)
+    refiner = Refiner(preset("tiny"))
+    with torch.no_grad():
+        [*refiner.heads.mlps["scales"].modules()][-1].bias.fill_(0.05)
+    save_refiner(refiner, path := tmp_path_factory.mktemp("helps") / "r.safetensors", {"keep": 0.5, "by": "opacity"})
+    return path
 
 
 def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys):
@@ -125,25 +105,11 @@ def test_a_goal_is_a_format_a_budget_and_a_page(goal, tmp_path, monkeypatch, cap
         assert f"{page}: {bytes_text(page.stat().st_size)}, to " in said
     assert ('<iframe src="my%20room_web.html" title="my-room"' in said) == (goal == "web")
     assert [*find_scenes(tmp_path)] == ["my room"]
-    run(
-        "compact",
-        "my room.ply",
-        "--for",
-        goal,
-        "--keep",
-        "50%",
-        "--html",
-        "both.html",
-        "--effort",
-        "instant",
-        "--force",
-    )
+    words = ("compact", "my room.ply", "--for", goal)
+    run(*words, "--keep", "50%", "--html", "both.html", "--effort", "instant", "--force")
     assert len(read_scene(file)) == 75 and len(parts_of(Path("both.html")).data["flight"]["scenes"]) == 2
-    capsys.readouterr()
-    refused = refusal(capsys, tmp_path / "small.ply", "my room.ply", "--for", goal)
-    assert (
-        f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place of --for" in refused
-    )
+    refused = refusal(capsys, tmp_path, *words, "-o", "small.ply")
+    assert f"small.ply: --for {goal} writes {wanted.suffix}; expected such a name, or --keep in place" in refused
 
 
 @pytest.mark.parametrize(
@@ -172,16 +138,14 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ply, helps, trained_walls, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours
-    output = tmp_path / "small.ply"
-    (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    said = refusal(capsys, output, ply, "--refiner", splatfacto)
-    assert "splatfacto-cpu; expected a pointsplat run" in said
-    assert "expected a trained pointsplat run" in refusal(capsys, output, ply, "--refiner", ply)
     torn = tmp_path / "torn.safetensors"
     torn.write_bytes(helps.read_bytes()[:1000])
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"
     for scene, options, wanted in (
+        (ply, ("--refiner", run_of(trained_walls, "wall-a")), "expected a pointsplat run"),
+        (ply, ("--refiner", ply), "expected a trained pointsplat run"),
+        (ply, ("-o", tmp_path / "small.obj"), ".spz, .sog"),
         (ply, ("--refiner", torn), "torn.safetensors: not a readable"),
         (ply, ("--refiner", tmp_path / "gone"), "no such file"),
         (ply, ("--refiner", tmp_path / "gone.safetensors"), "no such file"),
@@ -193,5 +157,5 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
         (ply, ("--picture", shown.with_suffix(".jpg")), "ends in .png"),
         (ply, ("--html", shown.with_suffix(".png")), "ends in .html"),
     ):
-        assert wanted in refusal(capsys, output, scene, *options), options
-    assert ".spz, .sog" in refusal(capsys, tmp_path / "small.obj", ply)
+        output = () if "-o" in options else ("-o", tmp_path / "small.ply")
+        assert wanted in refusal(capsys, tmp_path, "compact", scene, *options, *output), options

@@ -14,22 +14,17 @@ import psutil
 import pytest
 from compressed_plys import encode_compressed_ply
 from PIL import Image
+from refusing import refusal, run
 
 import pointsplat_ns as ps
 from html_parts import parts_of
 from making import ball, same
 from pointsplat_ns import folders
-from pointsplat_ns.cli import main
 from pointsplat_ns.io.formats import format_like, format_to_read
-
-
-def run(*args) -> None:
-    main([str(a) for a in args])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Two scenes."""
     folder = tmp_path_factory.mktemp("folder") / "rooms"
     for seed in (1, 2):
         ps.save(ball(120 + seed, seed=seed, log_size=-1.0, opacity=1.0, bright=1.0), folder / f"room{seed}.ply")
@@ -49,38 +44,25 @@ def test_every_scene_is_what_compact_makes_of_it_and_a_table_says_so(folder, cap
         row = next(line for line in said.splitlines() if f"room{seed}" in line)
         assert all(text in row for text in (f"{120 + seed}", f"{len(result.scene)}", f"{result.psnr:.1f}", "done"))
     assert said.endswith(f"{small}: 2 of 2 scenes, and the table scenes.csv\n")
-    before = (small / "room1.ply").stat().st_mtime_ns
     run("compact", folder, *OPTIONS, "--keep", "0.5")
     assert capsys.readouterr().out.count("done before") == 2
-    assert (small / "room1.ply").stat().st_mtime_ns == before
 
 
 def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
     scenes, small = tmp_path / "scenes", tmp_path / "small"
     scene = ps.load(folder / "room1.ply")
-    for name in ("a.ply", "b.spz", "c.sog", "d.splat", "f.spz", "f.ply"):
+    for name in ("a.ply", "d.splat", "f.spz", "f.ply"):
         ps.save(scene, scenes / name)
     (scenes / "g.ply").write_bytes(encode_compressed_ply(scene))
     run("compact", scenes, "-o", small, *OPTIONS, "--json")
     results = json.loads(capsys.readouterr().out)["scenes"]
     written = {Path(result["source"]).name: Path(result["output"]).name for result in results}
-    assert written == {
-        **{name: name for name in ("a.ply", "b.spz", "c.sog", "d.splat")},
-        **{"f.ply": "f_ply.ply", "f.spz": "f_spz.spz", "g.ply": "g.sog"},
-    }
+    renamed = {"f.ply": "f_ply.ply", "f.spz": "f_spz.spz", "g.ply": "g.sog"}
+    assert written == {"a.ply": "a.ply", "d.splat": "d.splat", **renamed}
     for result in results:
         path = Path(result["output"])
         assert len(ps.load(path)) == result["after"] == 61 and path.stat().st_size == result["megabytes"] * 1e6
         assert format_to_read(path) is format_like(Path(result["source"])) is not None
-
-
-def test_a_size_is_that_of_each_result_in_its_format(folder, tmp_path, capsys):
-    for name in ("a.ply", "b.spz", "c.splat"):
-        ps.save(ps.load(folder / "room1.ply"), tmp_path / "scenes" / name)
-    run("compact", tmp_path / "scenes", "--keep", "2kB", "--effort", "instant", "--json")
-    results = json.loads(capsys.readouterr().out)["scenes"]
-    assert all(0.0015 < result["megabytes"] <= 0.002 for result in results), results
-    assert len({result["after"] for result in results}) == 3
 
 
 @pytest.mark.parametrize(
@@ -102,11 +84,7 @@ def test_what_does_not_fit_a_folder_is_refused_in_one_line(words, said, folder, 
     (tmp_path / "rooms").symlink_to(folder)
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        run(*words)
-    error = capsys.readouterr().err
-    assert end.value.code == 1 and error.startswith("error: ") and error.count("\n") == 1 and said in error
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "rooms"]
+    assert said in refusal(capsys, tmp_path, *words)
 
 
 def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path, monkeypatch, capsys):
@@ -148,9 +126,7 @@ def test_a_gallery_shows_each_scene_before_and_after_or_why_not(folder, tmp_path
     assert before.std() > 20 and 0 < abs(before - after).mean() < 60, "the same view of another scene"
     page.unlink()
     (tmp_path / "small" / "pointsplat-scenes.json").unlink()
-    with pytest.raises(SystemExit):
-        run(*words)
-    assert "all.png: exists already" in capsys.readouterr().err, "it may be a picture of the user's"
+    assert "all.png: exists already" in refusal(capsys, tmp_path, *words), "it may be a picture of the user's"
 
 
 INTERRUPTED = """
@@ -164,12 +140,9 @@ main(["compact", sys.argv[1], "-o", sys.argv[2], "--keep", "50%", "--seconds", "
 def test_ctrl_c_stops_all_processes_at_once_and_leaves_nothing_unfinished(folder, tmp_path):
     small = tmp_path / "small"
     process = subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(folder), str(small)],
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+        [sys.executable, "-c", INTERRUPTED, str(folder), str(small)], start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
     deadline = time.monotonic() + 300
     while len(psutil.Process(process.pid).children()) < 3:  # two, and multiprocessing's tracker of resources
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()

@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from refusing import refusal
 
 import pointsplat_ns as ps
 from making import ball
@@ -55,10 +56,7 @@ def here(tmp_path, monkeypatch):
 def test_a_pipe_is_refused_in_one_line(pipe, words, said, capsys):
     Path(pipe).parent.mkdir(parents=True, exist_ok=True)
     os.mkfifo(pipe)
-    with pytest.raises(SystemExit) as end:
-        main([*words])
-    error = capsys.readouterr().err
-    assert end.value.code == 1 and error.count("\n") == 1 and said in error
+    assert said in refusal(capsys, Path(), *words)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusing import run
 
 import pointsplat_ns as ps
 from making import normal_scene
@@ -20,7 +21,7 @@ with open({log!r}, "a") as log:
 """
 
 COMMANDS = (
-    "compact scenes -o compacted --keep 4 --effort instant --jobs 2",
+    "compact scenes -o compacted --keep 4 --effort instant --jobs 2 --resolution 32x24",
     "prune scenes/1.ply -o merged.ply --keep 4",  # loads the kernels
 )
 """Commands that start processes."""
@@ -70,10 +71,10 @@ def test_nothing_in_the_current_folder_is_imported_or_run(words, planted):
 
 def test_a_matplotlibrc_of_the_current_folder_is_not_obeyed(planted):
     words = "prune scenes/1.ply --keep 4 --by paper --dry-run --plot {}.png"
-    assert pointsplat(planted, words.format("before")).returncode == 0
     (planted / "matplotlibrc").write_text("figure.facecolor: red\nsavefig.facecolor: red\nlines.linewidth: 9\n")
-    assert pointsplat(planted, words.format("after")).returncode == 0
-    assert (planted / "before.png").read_bytes() == (planted / "after.png").read_bytes()
+    assert pointsplat(planted, words.format("there")).returncode == 0
+    run(*words.format(planted / "here").replace("scenes", str(planted / "scenes")).split())
+    assert (planted / "here.png").read_bytes() == (planted / "there.png").read_bytes()
 
 
 def test_each_place_that_starts_processes_is_known():

@@ -28,8 +28,6 @@ def ply(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture()
 def as_json(capsys):
-    """A function that runs a command with --json and gives what it printed."""
-
     def run(*words: object) -> dict:
         main([*map(str, words), "--json"])
         return json.loads(capsys.readouterr().out)
@@ -95,9 +93,3 @@ def test_what_libraries_print_and_what_is_found_go_to_standard_error(ply, capsys
     said = capsys.readouterr()
     assert json.loads(said.out)["gaussians"] == 5
     assert said.err.splitlines() == ["a library speaks", "a finding"]
-
-
-def test_what_was_chosen_for_the_scene_is_printed_if_asked_for(ply, capsys):
-    main(["prune", str(ply), "--keep", "50%", "--dry-run", "--verbose"])
-    said = capsys.readouterr().out
-    assert "sizes of merged Gaussians x " in said and "views of" in said

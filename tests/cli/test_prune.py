@@ -8,10 +8,10 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
+from refusing import refusal, run
 
 import pointsplat_ns as ps
-from making import ball, normal_scene, same
-from pointsplat_ns.cli import main
+from making import ball, normal_scene, run_of, same
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
@@ -27,33 +27,9 @@ def ply(tmp_path) -> Path:
     return tmp_path / "scene.ply"
 
 
-@pytest.fixture()
-def splatfacto_run(trained_walls) -> Path:
-    (run,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    return run
-
-
 @pytest.fixture(scope="module")
 def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
     return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
-
-
-def run(*args) -> None:
-    main([str(a) for a in args])
-
-
-def refusal(capsys, output: Path, *args, warnings: int = 0) -> str:
-    """The line on stderr with which a command refuses, after so many lines of warnings; it prints nothing else and
-    writes nothing."""
-    before = sorted(output.parent.rglob("*")) if output.parent.is_dir() else None
-    with pytest.raises(SystemExit) as caught:
-        run(*args, "-o", output)
-    said = capsys.readouterr()
-    assert caught.value.code == 1 and said.out == ""
-    *warned, error = said.err.splitlines()
-    assert error.startswith("error: ") and len(warned) == warnings
-    assert (sorted(output.parent.rglob("*")) if output.parent.is_dir() else None) == before, "partial output"
-    return error
 
 
 def test_prune_scores_as_it_is_told(ply, tmp_path):
@@ -65,17 +41,18 @@ def test_prune_scores_as_it_is_told(ply, tmp_path):
 
 
 def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
-    output = tmp_path / "out.ply"
-    assert "gone.ply: no such file" in refusal(capsys, output, "prune", tmp_path / "gone.ply")
-    assert "another method" in refusal(capsys, output, "prune", refined_run)
     half = tmp_path / "half.ply"
     half.write_bytes(ply.read_bytes()[:-100])
-    assert "half.ply" in refusal(capsys, output, "prune", half)
-    for by in ("paper", "authors"):
-        said = refusal(capsys, output, "prune", ply, "--by", by, "--opacity-weight", "2")
-        assert "opacity_weight is 2.0; expected 0 to 1" in said
     write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
-    assert "holds no Gaussians" in refusal(capsys, output, "prune", tmp_path / "nothing.ply")
+    for words, said in (
+        ([tmp_path / "gone.ply"], "gone.ply: no such file"),
+        ([refined_run], "another method"),
+        ([half], "half.ply"),
+        ([tmp_path / "nothing.ply"], "holds no Gaussians"),
+        ([ply, "--by", "paper", "--opacity-weight", 2], "opacity_weight is 2.0; expected 0 to 1"),
+        ([ply, "--by", "authors", "--opacity-weight", 2], "opacity_weight is 2.0; expected 0 to 1"),
+    ):
+        assert said in refusal(capsys, tmp_path, "prune", *words, "-o", tmp_path / "out.ply")
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])
@@ -111,33 +88,25 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
     (tmp_path / "damaged.ply").touch()
-    assert message in refusal(capsys, tmp_path / "out.ply", "prune", tmp_path / "damaged.ply", *options)
+    assert message in refusal(capsys, tmp_path, "prune", tmp_path / "damaged.ply", *options)
 
 
 @pytest.mark.parametrize("named", ["folder", "ckpt seen from its folder"])
-def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, splatfacto_run, tmp_path, monkeypatch):
+def test_a_run_gets_its_ply_in_its_folder_and_never_among_its_checkpoints(named, trained_walls, tmp_path, monkeypatch):
     folder = tmp_path / "run"
-    shutil.copytree(splatfacto_run, folder)
+    shutil.copytree(run_of(trained_walls, "wall-a"), folder)
     before = sorted(folder.rglob("*"))
     (checkpoint,) = (folder / "nerfstudio_models").iterdir()
-    scene = {"folder": folder, "config": folder / "config.yml", "ckpt": checkpoint}.get(named, Path(checkpoint.name))
-    if named == "ckpt seen from its folder":
-        monkeypatch.chdir(checkpoint.parent)
-    run("prune", scene, "--keep", "10%", "--by", "opacity")
+    monkeypatch.chdir(checkpoint.parent)
+    run("prune", folder if named == "folder" else checkpoint.name, "--keep", "10%", "--by", "opacity")
     assert set(folder.rglob("*")) - set(before) == {folder / "pruned.ply"}
 
 
-@pytest.fixture()
-def posed(tmp_path) -> tuple[Path, Path]:
-    """A room, and a file of cameras in it."""
-    scene = ball(300, opacity=1.0, bright=1.0)
-    write_ply(scene, tmp_path / "room.ply")
-    return tmp_path / "room.ply", written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
-def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(posed, tmp_path, capsys, suffix):
-    room, poses = posed
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, capsys, suffix):
+    room, scene = tmp_path / "room.ply", ball(300, opacity=1.0, bright=1.0)
+    write_ply(scene, room)
+    poses = written(inria(sample_views(scene, 5, 64, 48)), tmp_path / "cameras.json")
     run("prune", room, "--keep", "2MB", "--poses", poses, "-o", tmp_path / f"small{suffix}")
     said = capsys.readouterr().out
     assert "nothing is merged, all 300 Gaussians fit as they are" in said

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusing import refusal
 
 from killing import KILLED_AFTER_STEPS
 from making import normal_scene, quick_start
@@ -31,22 +32,22 @@ def pruned(folder: Path, *words: object, killed_at: int = 0) -> tuple[int, str]:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes")
 def test_processes_that_share_a_scene_write_the_bytes_of_one_also_after_a_kill(tmp_path):
-    write_ply(normal_scene(1500, degree=1, seed=3), tmp_path / "scene.ply")
-    parts = ("--memory", "100kB", "-o")
+    write_ply(normal_scene(600, degree=1, seed=3), tmp_path / "scene.ply")
+    parts = ("--memory", "50kB", "-o")
     status, said = pruned(tmp_path, *parts, "alone.ply")
     assert status == 0, said
     status, said = pruned(tmp_path, *parts, "shared.ply", "--jobs", 2, killed_at=5)
     assert status != 0 and not (tmp_path / "shared.ply").exists(), said
     assert len(list((tmp_path / ".shared.ply.cells").glob("round*"))) >= 2
     status, said = pruned(tmp_path, *parts, "shared.ply", "--jobs", 2)
-    assert status == 0 and said.count("merged to 150 of 1,500 Gaussians") == 1, said
+    assert status == 0 and said.count("merged to 60 of 600 Gaussians") == 1, said
     assert (tmp_path / "shared.ply").read_bytes() == (tmp_path / "alone.ply").read_bytes()
     assert not list(tmp_path.glob(".*"))
 
 
-def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path):
+def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path, capsys):
     write_ply(normal_scene(50), tmp_path / "scene.ply")
-    status, said = pruned(tmp_path, "--jobs", 2)
-    assert status == 1 and "scene.ply: fits into memory; --jobs is for a scene that is merged in parts" in said
-    status, said = pruned(tmp_path, "--jobs", 0, "--memory", "10kB")
-    assert status == 1 and "jobs is 0; expected 1 or more" in said
+    words = ("prune", tmp_path / "scene.ply", "--keep", "10%", "--jobs")
+    fits = "scene.ply: fits into memory; --jobs is for a scene that is merged in parts"
+    assert fits in refusal(capsys, tmp_path, *words, 2)
+    assert "jobs is 0; expected 1 or more" in refusal(capsys, tmp_path, *words, 0, "--memory", "10kB")

@@ -1,18 +1,11 @@
 """A trained run as nerfstudio itself writes one, shared by the tests of this folder."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-from making import normal_scene
-
-_MAKE_CONFIG = """
-import sys, yaml
-from pathlib import Path
+import yaml
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -21,20 +14,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
-data = Path("data/kitchen")
-for method, model in (("splatfacto", SplatfactoModelConfig()), ("nerfacto", ModelConfig())):
-    datamanager = FullImageDatamanagerConfig(data=data, dataparser=NerfstudioDataParserConfig(load_3D_points=True))
-    optimizer = {"optimizer": AdamOptimizerConfig(lr=1e-3), "scheduler": ExponentialDecaySchedulerConfig()}
-    config = TrainerConfig(
-        method_name=method, data=data, output_dir=Path("outputs"), timestamp="2024-05-06_070809",
-        pipeline=VanillaPipelineConfig(datamanager=datamanager, model=model), optimizers={"means": optimizer},
-    )
-    config.set_experiment_name()
-    Path(sys.argv[1], f"{method}.yml").write_text(yaml.dump(config), "utf8")
-"""
+
+from making import normal_scene
 
 
-def _checkpoint_of(scene, step=29999, prefix="_model.gauss_params."):
+def saved_by_nerfstudio(scene, step=29999, prefix="_model.gauss_params."):
     """The content of a checkpoint with all that nerfstudio's trainer puts in one."""
     parameters = {name: torch.nn.Parameter(value.clone()) for name, value in scene.items()}
     optimizers, schedulers = {}, {}
@@ -56,33 +40,30 @@ def _checkpoint_of(scene, step=29999, prefix="_model.gauss_params."):
 
 @pytest.fixture
 def checkpoint_of():
-    """``checkpoint_of(scene, step, prefix)``: what nerfstudio's trainer saves of it."""
-    return _checkpoint_of
+    return saved_by_nerfstudio
 
 
 @pytest.fixture(scope="session")
-def config_texts(tmp_path_factory):
+def config_texts():
     """``config.yml`` of splatfacto and of nerfacto, as the installed nerfstudio dumps them."""
-    pytest.importorskip("nerfstudio", reason="nerfstudio writes the configurations that are read here")
-    folder = tmp_path_factory.mktemp("configs")
-    # In a process of its own, so that the tests can prove that the readers import none of it.
-    subprocess.run([sys.executable, "-W", "ignore", "-c", _MAKE_CONFIG, str(folder)], check=True, capture_output=True)
-    return {path.stem: path.read_text("utf8") for path in folder.glob("*.yml")}
+    data, found = Path("data/kitchen"), {}
+    for method, model in (("splatfacto", SplatfactoModelConfig()), ("nerfacto", ModelConfig())):
+        parser = NerfstudioDataParserConfig(load_3D_points=True)
+        manager = FullImageDatamanagerConfig(data=data, dataparser=parser)
+        optimizer = {"optimizer": AdamOptimizerConfig(lr=1e-3), "scheduler": ExponentialDecaySchedulerConfig()}
+        config = TrainerConfig(
+            method_name=method, data=data, output_dir=Path("outputs"), timestamp="2024-05-06_070809",
+            pipeline=VanillaPipelineConfig(datamanager=manager, model=model), optimizers={"means": optimizer},
+        )  # fmt: skip
+        config.set_experiment_name()
+        found[method] = yaml.dump(config)
+    return found
 
 
 @pytest.fixture
 def make_run(tmp_path, config_texts):
-    """A function that lays out a run below ``tmp_path`` and returns its folder."""
-
-    def make(
-        experiment="kitchen",
-        method="splatfacto",
-        time="2024-05-06_070809",
-        steps=(1999,),
-        scene=None,
-        outputs="outputs",
-    ):
-        folder = tmp_path / outputs / experiment / method / time
+    def make(experiment="kitchen", method="splatfacto", time="2024-05-06_070809", steps=(1999,), scene=None):
+        folder = tmp_path / "outputs" / experiment / method / time
         (folder / "nerfstudio_models").mkdir(parents=True)
         text = config_texts.get(method, config_texts["splatfacto"])
         text = text.replace("experiment_name: kitchen", f"experiment_name: {experiment}")
@@ -90,9 +71,9 @@ def make_run(tmp_path, config_texts):
         text = text.replace("timestamp: 2024-05-06_070809", f"timestamp: {time}")
         (folder / "config.yml").write_text(text)
         for step in steps:
-            content = _checkpoint_of(normal_scene(seed=step) if scene is None else scene, step)
+            content = saved_by_nerfstudio(normal_scene(seed=step) if scene is None else scene, step)
             torch.save(content, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
         (tmp_path / "data" / "kitchen").mkdir(parents=True, exist_ok=True)
-        return Path(folder)
+        return folder
 
     return make

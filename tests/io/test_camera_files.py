@@ -1,15 +1,16 @@
 """Files of cameras are read as their own projects read them; anything else is refused in one line, without harm."""
 
-import json
 import math
 import os
 import struct
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
+from refusing import fails
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
@@ -20,11 +21,8 @@ from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap
 
 SEED = 3
 
-IDENTITY = torch.eye(4).tolist()
-
 
 def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
-    """Cameras that stand and look anywhere."""
     generator = torch.Generator().manual_seed(SEED)
     turns = rotation_matrices(torch.randn(count, 4, generator=generator, dtype=torch.float64))
     places = torch.randn(count, 3, 1, generator=generator, dtype=torch.float64)
@@ -70,10 +68,8 @@ def test_cameras_are_those_that_were_written(kind, tmp_path):
 
 @pytest.mark.parametrize(
     ("model", "named"),
-    [
-        ("sparse/0", "."), ("sparse", "."), ("colmap/sparse/0", "."), ("sparse/0", "sparse/0/images.bin"),
-    ],
-)  # fmt: skip
+    [("sparse/0", "."), ("sparse", "."), ("colmap/sparse/0", "."), ("sparse/0", "sparse/0/images.bin")],
+)
 def test_the_model_of_a_colmap_project_is_found_below_its_root(model, named, tmp_path):
     views = some_views()
     write_colmap_binary(views, tmp_path / model)
@@ -125,18 +121,11 @@ def test_poses_are_moved_to_where_nerfstudio_trains(tmp_path):
     torch.testing.assert_close(viewmats_to_opengl(read_views(path).viewmats).float(), expected, rtol=0, atol=2e-6)
 
 
-def moved_as(transform: torch.Tensor, scale: float) -> str:
-    return json.dumps({"transform": transform.tolist(), "scale": scale})
-
-
-TURN = torch.tensor([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]], dtype=torch.float64)
-
-
 def test_transforms_that_are_no_rigid_motion_are_refused(tmp_path):
     path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
-    (tmp_path / "dataparser_transforms.json").write_text(moved_as(2 * TURN, 1.0))
-    with pytest.raises(ps.DataError, match=r"dataparser_transforms.json: its transform is no rigid motion"):
-        read_views(path)
+    doubled = {"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]], "scale": 1}
+    written(doubled, tmp_path / "dataparser_transforms.json")
+    fails(lambda: read_views(path), "dataparser_transforms.json: its transform is no rigid motion", error=ps.DataError)
 
 
 @pytest.mark.parametrize(
@@ -206,37 +195,19 @@ def test_other_json_is_refused_in_one_line(content, message, tmp_path):
     assert str(raised.value).startswith(str(path)) and "\n" not in str(raised.value) and len(str(raised.value)) < 600
 
 
-def colmap_texts(cameras_text: str | None = None, images_text: str | None = None):
+def damaged(file: str, change) -> Callable[[Path], Path]:
+    """A function that writes a model and changes the bytes of one of its files."""
+
     def write(folder: Path) -> Path:
-        write_colmap_text(some_views(2), folder)
-        for name, text in (("cameras.txt", cameras_text), ("images.txt", images_text)):
-            if text is not None:
-                (folder / name).write_text(text)
+        (write_colmap_text if file.endswith("txt") else write_colmap_binary)(some_views(2), folder)
+        (folder / file).write_bytes(change((folder / file).read_bytes()))
         return folder
 
     return write
 
 
-def colmap_bytes(at: int, value: bytes, file: str = "images.bin"):
-    """A binary model with bytes replaced from a place on."""
-
-    def write(folder: Path) -> Path:
-        write_colmap_binary(some_views(2), folder)
-        data = bytearray((folder / file).read_bytes())
-        data[at : at + len(value)] = value
-        (folder / file).write_bytes(data)
-        return folder
-
-    return write
-
-
-def cut(file: str, size: int):
-    def write(folder: Path) -> Path:
-        write_colmap_binary(some_views(2), folder)
-        os.truncate(folder / file, size)
-        return folder
-
-    return write
+def images_with(at: int, value: bytes) -> Callable[[Path], Path]:
+    return damaged("images.bin", lambda data: data[:at] + value + data[at + len(value) :])
 
 
 NAME_AT = 8 + 64
@@ -248,15 +219,24 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (colmap_texts("3 PINHOLE 64 48 50 50 30\n"), "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera"),
-        (colmap_texts("3 EQUIRECTANGULAR 64 48 64 48\n"), "a camera of model EQUIRECTANGULAR; expected one of SIMPLE"),
-        (colmap_texts(None, "1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
-        (colmap_texts(None, "1 1 0 0 0 0 0 0 3 " + "a" * 10_000), "a line of more than 4096 bytes"),
-        (colmap_bytes(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
-        (colmap_bytes(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
-        (colmap_bytes(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
-        (colmap_bytes(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
-        (cut("images.bin", NAME_AT + 3), r"images.bin: says that it has 2 entries and has room for 0"),
+        (
+            damaged("cameras.txt", lambda _: b"3 PINHOLE 64 48 50 50 30\n"),
+            "cameras.txt: '3 PINHOLE 64 48 50 50 30' is no camera",
+        ),
+        (
+            damaged("cameras.txt", lambda _: b"3 EQUIRECTANGULAR 64 48 64 48\n"),
+            "model EQUIRECTANGULAR; expected one of",
+        ),
+        (damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3\n\n"), "images.txt: '1 1 0 0 0 0 0 0 3' is no image"),
+        (damaged("images.txt", lambda _: b"1 1 0 0 0 0 0 0 3 " + b"a" * 10_000), "a line of more than 4096 bytes"),
+        (images_with(0, struct.pack("<Q", 2**63)), r"images.bin: says that it has \d+ entries and has room for 2"),
+        (images_with(8 + 4, struct.pack("<d", math.nan)), "the pose of camera 0 .frame_0.png. is no rigid motion"),
+        (images_with(POINTS_AT, struct.pack("<Q", 2**62)), "an image with 4611686018427387904 points, for which the"),
+        (images_with(NAME_AT, b"a" * 20_000), "no end of an image's name within 4096 bytes"),
+        (
+            damaged("images.bin", lambda data: data[: NAME_AT + 3]),
+            r"images.bin: says that it has 2 entries and has room for 0",
+        ),
     ],
 )
 def test_damaged_colmap_models_are_refused_in_one_line(write, message, tmp_path):
@@ -288,10 +268,7 @@ def test_points_take_no_memory(tmp_path):
 def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="no such file; expected cameras.json of 3DGS, transforms.json"):
         read_views(tmp_path / "nothing.json")
-    with pytest.raises(
-        ps.DataError, match="a folder without cameras.bin or cameras.txt, there or in sparse/0; expected"
-    ):
-        read_views(tmp_path)
+    fails(lambda: read_views(tmp_path), "a folder without cameras.bin or cameras.txt, there or in sparse/0; expected")
     folder = write_colmap_binary(some_views(2), tmp_path / "sparse")
     (folder / "cameras.bin").unlink()
     with pytest.raises(ps.DataError, match="cameras.bin: no such file; expected a COLMAP model"):

@@ -9,7 +9,8 @@ import numpy.lib.recfunctions
 import psutil
 import pytest
 import torch
-from plyfile import PlyData, PlyElement, PlyListProperty
+from plyfile import PlyData, PlyElement
+from refusing import fails as refused
 
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
@@ -22,12 +23,10 @@ def rows_of(path):
 
 
 def rewrite(path, rows, **kwargs):
-    """The file again, by plyfile itself."""
     PlyData([PlyElement.describe(rows, "vertex")], **kwargs).write(str(path))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("n", [0, 1, 16_384 + 3])  # the last crosses a boundary of chunks
+@pytest.mark.parametrize(("n", "degree"), [(0, 1), (1, 0), (5, 2), (16_384 + 3, 3)])  # the last: two chunks
 def test_round_trip_is_exact_to_the_bit(tmp_path, n, degree):
     scene = normal_scene(n, degree)
     write_ply(scene, tmp_path / "a.ply")
@@ -60,16 +59,14 @@ def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
     write_ply(scene, tmp_path / "a.ply")
     rows = rows_of(tmp_path / "a.ply")
     order = [*reversed(rows.dtype.names), "red", "weight"]
-    mixed = np.zeros(
-        5, [(name, "u1" if name == "red" else "f8" if name in ("weight", "x") else "f4") for name in order]
-    )
+    kinds = {"red": "u1", "weight": "f8", "x": "f8"}
+    mixed = np.zeros(5, [(name, kinds.get(name, "f4")) for name in order])
     for name in rows.dtype.names:
         mixed[name] = rows[name]
     before = PlyElement.describe(np.zeros(3, [("a", "i4"), ("b", "u1")]), "camera")
     after = PlyElement.describe(np.array([([1, 2, 3],)], [("vertex_indices", "O")]), "face")
-    PlyData([before, PlyElement.describe(mixed, "vertex"), after], text=text, byte_order="<").write(
-        str(tmp_path / "b.ply")
-    )
+    elements = [before, PlyElement.describe(mixed, "vertex"), after]
+    PlyData(elements, text=text, byte_order="<").write(str(tmp_path / "b.ply"))
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
 
 
@@ -137,28 +134,15 @@ def test_lists_before_the_gaussians_are_skipped_in_ascii_alone(tmp_path):
     fails(tmp_path / "False.ply", "element 'face' of lists stands before 'vertex'")
 
 
-# What can be wrong with a file
-
-
 def fails(path, *fragments):
-    with pytest.raises(SceneError) as caught:
-        read_ply(path)
-    text = str(caught.value)
-    assert text.startswith(str(path)) and "\n" not in text
-    for fragment in fragments:
-        assert fragment in text, text
-
-
-@pytest.fixture
-def good(tmp_path):
-    write_ply(normal_scene(7, 3), tmp_path / "scene.ply")
-    return tmp_path / "scene.ply"
+    assert refused(lambda: read_ply(path), *fragments, error=SceneError).startswith(str(path))
 
 
 @pytest.mark.parametrize("cut", [1, 247, 248, 1000])
-def test_truncated_data_is_said_with_both_counts(good, cut):
-    good.write_bytes(good.read_bytes()[:-cut])
-    fails(good, "truncated", "declares 7 Gaussians", f"holds {7 - math.ceil(cut / 248)}")
+def test_truncated_data_is_said_with_both_counts(tmp_path, cut):
+    write_ply(normal_scene(7, 3), tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-cut])
+    fails(tmp_path / "a.ply", "truncated", "declares 7 Gaussians", f"holds {7 - math.ceil(cut / 248)}")
 
 
 def columns(*without):
@@ -178,10 +162,7 @@ def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("element", "properties", "fragments"),
     [
-        *(
-            ("vertex", columns(name), [f"lacks the vertex property '{name}'"])
-            for name in ("x", "f_rest_7", "opacity", "rot_3")
-        ),
+        ("vertex", columns("f_rest_7"), ["lacks the vertex property 'f_rest_7'"]),
         ("vertex", columns("f_rest_44", "f_rest_43"), ["has 43 f_rest properties", "0, 9, 24, 45 or 72"]),
         ("vertex", [*columns()[:3], ("red", "u1")], ["lacks the vertex property 'f_dc_0' and 10 more"]),
         ("vertex", [("packed_position", "u4"), ("packed_rotation", "u4")], ["compressed PLY", "expected a plain one"]),
@@ -200,11 +181,8 @@ JUNK = "element junk 1000000000000000\nproperty double a\nelement vertex 1"
 @pytest.mark.parametrize(
     ("form", "elements"),
     [
-        *(
-            (form, f"element vertex {count}")
-            for count in (10**15, "9" * 400)
-            for form in ("binary_little_endian", "ascii")
-        ),
+        ("binary_little_endian", f"element vertex {10**15}"),
+        ("ascii", f"element vertex {'9' * 400}"),
         ("binary_little_endian", JUNK),
     ],
 )
@@ -215,16 +193,6 @@ def test_an_absurd_count_is_refused_before_memory_is_taken(tmp_path, form, eleme
     fails(tmp_path / "a.ply", "truncated", *([] if elements == JUNK else ["holds"]))
 
 
-def test_list_properties_of_vertices_are_refused(tmp_path):
-    rows = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("lists", "O")])
-    for row in rows:
-        row["lists"] = np.zeros(3, "i4")
-    element = PlyElement.describe(rows, "vertex")
-    assert any(isinstance(prop, PlyListProperty) for prop in element.properties)
-    PlyData([element], byte_order="<").write(str(tmp_path / "a.ply"))
-    fails(tmp_path / "a.ply", "vertex property 'lists' is a list")
-
-
 @pytest.mark.parametrize(
     ("line", "fragment"),
     [
@@ -233,6 +201,7 @@ def test_list_properties_of_vertices_are_refused(tmp_path):
         ("property float x", "line 3 is not understood"),
         ("element vertex 1\nproperty float x\nproperty float x", "declares vertex property 'x' twice"),
         ("element vertex 1\nelement vertex 1", "declares element 'vertex' twice"),
+        ("element vertex 1\nproperty list uchar int lists", "vertex property 'lists' is a list"),
         ("rubbish", "line 3 is not understood: 'rubbish'"),
         (None, "names no format"),
     ],
@@ -247,10 +216,7 @@ def test_a_damaged_header_line_is_quoted(tmp_path, line, fragment):
     ("damage", "fragment"),
     [
         (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "row 2: property 'rot_3': early end-of-line"),
-        (
-            lambda lines: [*lines[:-1], lines[-1].replace(lines[-1].split()[0], "what", 1)],
-            "row 2: property 'x': malformed input",
-        ),
+        (lambda lines: [*lines[:-1], "what " + lines[-1].split(" ", 1)[1]], "row 2: property 'x': malformed input"),
         (lambda lines: [*lines[:-1], lines[-1].rstrip() + " 1\n"], "row 2: expected end-of-line"),
         (lambda lines: lines[:-1], "row 2: early end-of-file"),
     ],

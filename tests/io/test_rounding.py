@@ -16,18 +16,15 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
-from pointsplat_ns.io.formats import format_to_write, spz
+from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounded, rounding_for, steps_of
-from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounding_for, steps_of
 from pointsplat_ns.merging.covariance import covariances, unpack
-from pointsplat_ns.rasterizer import render
 
 SILENT = lambda *told: None  # noqa: E731
 
 
 def one() -> Gaussians:
-    """A Gaussian twice as long as wide, at the origin."""
     return Gaussians(
         means=torch.zeros(1, 3),
         scales=torch.tensor([[0.2, 0.1, 0.1]]).log(),
@@ -90,21 +87,6 @@ def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
     assert sizes[0] > 1.1 * sizes[1] > 1.1**2 * sizes[2]
 
 
-def test_a_tolerance_beats_fewer_bits_for_all(tmp_path, monkeypatch):
-    room = ps.example_room()[::4]
-    views = ps.sample_views(room, 4, width=160, height=120)
-
-    def written(data: bytes) -> tuple[int, float]:
-        (tmp_path / "a.spz").write_bytes(data)
-        scene = ps.load(tmp_path / "a.spz")
-        return len(data), sum(float((render(scene, view) - render(room, view)).square().mean()) for view in views)
-
-    smaller, less = written(encode_spz(rounded(room, Rounding(0.007))))
-    monkeypatch.setattr(spz, "SH_BITS", (3, 3))
-    size, error = written(encode_spz(room))
-    assert smaller < size and less < error
-
-
 def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
     scene = cloud(50, seed=3, sh_degree=1)
     columns = {name: column.astype(np.float64) for name, column in reversed(columns_of(scene).items())}
@@ -135,17 +117,9 @@ def test_rows_are_refused_as_whole_files_are_and_when_a_file_shrinks(tmp_path):
 
 
 def rows_of(n, dims, seed=0):
-    """Rows about 300 centres, as real SH are about few."""
     generator = torch.Generator().manual_seed(seed)
     centres = torch.randn(300, dims, generator=generator)
     return centres[torch.randint(300, (n,), generator=generator)] + 0.01 * torch.randn(n, dims, generator=generator)
-
-
-@pytest.mark.parametrize("values", [torch.zeros(5), torch.tensor([1.0]), torch.linspace(-3, 3, 256)])
-def test_a_codebook_of_few_numbers_is_exact(values):
-    book, index = codebook(values)
-    assert book.shape == (256,) and index.dtype == torch.uint8
-    assert torch.allclose(book[index.long()], values, atol=1e-6)
 
 
 @pytest.mark.parametrize("different", [1, 300, 700])

@@ -5,20 +5,11 @@ import logging
 
 import pytest
 import torch
+from refusing import fails
 
 from making import normal_scene, same
-from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name
 from pointsplat_ns.io.inert_yaml import Tagged
-
-
-def fails(call, *fragments):
-    with pytest.raises(SceneError) as caught:
-        call()
-    text = str(caught.value)
-    assert "\n" not in text
-    for fragment in fragments:
-        assert str(fragment) in text, text
 
 
 def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):

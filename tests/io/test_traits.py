@@ -18,8 +18,6 @@ from pointsplat_ns.rasterizer.scene import pixels_of
 AXIS = "-x"
 """Up in these tests, which no estimate would choose."""
 
-PLYS = pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
-
 
 @pytest.fixture(scope="module")
 def room() -> ps.Gaussians:
@@ -27,15 +25,11 @@ def room() -> ps.Gaussians:
     return ps.example_room()[::25]
 
 
-def named(folder, suffix):
-    return folder / (suffix if not suffix.startswith(".") else f"a{suffix}")
-
-
 def trained_so(scene):
     return scene.replace(antialiased=True)
 
 
-@PLYS
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
 @pytest.mark.parametrize(
     ("comments", "traits"),
     [
@@ -67,18 +61,11 @@ def test_the_last_comment_of_a_ply_that_names_a_trait_counts(tmp_path, suffix, c
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_files_that_can_hold_antialiasing_keep_it(tmp_path, suffix):
     for scene in (cloud(20), trained_so(cloud(20))):
-        ps.save(scene, named(tmp_path, suffix), overwrite=True)
-        back = ps.load(named(tmp_path, suffix))
+        ps.save(scene, tmp_path / f"a{suffix}", overwrite=True)
+        back = ps.load(tmp_path / f"a{suffix}")
         assert back.antialiased is scene.antialiased and len(back) == 20
     (tmp_path / "4.spz").write_bytes(encode_spz4(trained_so(cloud(20))))
     assert ps.load(tmp_path / "4.spz").antialiased
-
-
-def test_files_that_cannot_hold_antialiasing_are_warned_of(tmp_path, caplog):
-    ps.save(cloud(3, sh_degree=0), tmp_path / "a.splat")
-    assert not caplog.text
-    ps.save(trained_so(cloud(3, sh_degree=0)), tmp_path / "a.splat", overwrite=True)
-    assert "the mark of antialiased training; .sog keeps it" in caplog.text
 
 
 def test_traits_stay_on_every_way_through_the_package():

@@ -26,18 +26,6 @@ def test_psnr_of_covered_pixels_at_all_extremes(error, covered):
     assert math.isnan(psnr_of(math.nan, covered))
 
 
-@pytest.mark.parametrize("shape", [(11, 11), (24, 37)])
-def test_ssim_is_torchmetrics_away_from_the_border(shape):
-    torchmetrics = pytest.importorskip("torchmetrics.functional.image")
-    a, b = pair(2, *shape, dtype=torch.float64)
-    nchw = (x.permute(0, 3, 1, 2) for x in (a, b))
-    _, full = torchmetrics.structural_similarity_index_measure(
-        *nchw, data_range=1.0, reduction="none", return_full_image=True
-    )
-    expected = full[:, :, 5:-5, 5:-5].mean(dim=(1, 2, 3))  # torchmetrics also averages a reflected border of 5
-    assert torch.allclose(ssim(a, b), expected, atol=1e-6)  # windows summed in another order
-
-
 def test_ssim_in_float32_is_that_of_float64_on_extreme_images():
     a, b = pair(24, 24, dtype=torch.float64)
     stripes = (torch.arange(24) % 2).double()[:, None, None].expand(24, 24, 3)
@@ -48,7 +36,7 @@ def test_ssim_in_float32_is_that_of_float64_on_extreme_images():
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_gradients_agree_with_float64_differences(metric):
     a, b = pair(12, 13, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x: metric(x, b), a.requires_grad_(), fast_mode=True)
+    assert torch.autograd.gradcheck(metric, (a.requires_grad_(), b.requires_grad_()), fast_mode=True)
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
@@ -85,13 +73,10 @@ def test_value_and_gradient_are_pytorch_msssims(size, batch):
     value, expected = mean_ssim(image, other), stock(image, other)
     # pytorch-msssim keeps its window in float32: 1e-7 relative on moments of order 1, over C2 = 9e-4 at worst.
     torch.testing.assert_close(value, expected, atol=1e-5, rtol=0)
+    if min(size) >= 11:
+        torch.testing.assert_close(ssim(*(x.permute(0, 2, 3, 1) for x in (image, other))).mean(), value)
     (gradient,), (other_gradient,) = (torch.autograd.grad(v, image) for v in (value, expected))
     assert (gradient - other_gradient).abs().max() <= 1e-4 * other_gradient.abs().max()
-
-
-def test_gradients_of_ssim_agree_with_float64_differences():
-    image, other = images(1, 2, 12, 13)
-    assert torch.autograd.gradcheck(mean_ssim, (image, other.requires_grad_()))
 
 
 @pytest.mark.parametrize("compiled", [None, False], ids=["as it is", "torch"])

@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
 import pointsplat_ns as ps
+from making import run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.errors import DataError
@@ -28,7 +29,6 @@ BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
 def some_cameras(num: int = 3) -> Cameras:
-    """Turned and moved at random, off-centre, with unequal focal lengths."""
     generator = torch.Generator().manual_seed(SEED)
     turn = torch.linalg.qr(torch.randn(num, 3, 3, generator=generator))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
@@ -99,21 +99,14 @@ def test_datamanager_gives_what_nerfstudios_gives_in_its_order(wall_scene):
     assert sorted(seen) == list(range(len(ours)))
 
 
-@pytest.fixture()
-def run(trained_walls) -> Path:
-    """The run of SH degree 1 over white."""
-    (config,) = (trained_walls / "wall-b").rglob("config.yml")
-    return config.parent
-
-
 def mean_psnr(scene: Gaussians, run: Path) -> float:
-    """In the held-out photos of a run, dB."""
     photos = run_photos(run, "test")
     errors = [ps.psnr(ps.render(scene, photo.view), in_unit_range(photo.target)) for photo in photos]
     return float(torch.stack(errors).mean())
 
 
-def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(run, tmp_path, monkeypatch):
+def test_a_sweep_trains_on_the_photos_of_a_run_as_its_command_does(trained_walls, tmp_path, monkeypatch):
+    run = run_of(trained_walls, "wall-b")
     monkeypatch.setitem(PHOTO_STEPS, "quick", 96)
     found = ps.measure_tradeoff(run, tmp_path / "trade", keep=("10%",), repairs=("none", "photos"))
     assert found.points[0].against_photos.psnr == pytest.approx(mean_psnr(ps.load(run), run), abs=1e-4)

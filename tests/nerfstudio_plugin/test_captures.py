@@ -1,6 +1,5 @@
 """Captures of all kinds."""
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -27,8 +26,6 @@ FISHEYE = Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001), focal=(30.0, 30.5
 
 @dataclass
 class Layout:
-    """How a capture is laid out, and what reads it."""
-
     lens: Lens
     write: Callable[[Capture, Path], Path]
     dataparser: Callable[[], DataParserConfig]
@@ -50,14 +47,7 @@ def nerfstudio_data() -> NerfstudioDataParserConfig:
 
 LAYOUTS = {
     "nerfstudio-data": Layout(Lens(), Capture.write_nerfstudio, nerfstudio_data),
-    "nerfstudio-data, equidistant fisheye": Layout(
-        Lens("OPENCV_FISHEYE", focal=(30.0, 30.5)), Capture.write_nerfstudio, nerfstudio_data
-    ),
     "colmap": Layout(Lens(distortion=(0.12, -0.05, 0.004, -0.003)), as_colmap, ColmapDataParserConfig),
-    # With a k4, nerfstudio's parser refuses even a fisheye.
-    "colmap, fisheye": Layout(
-        dataclasses.replace(FISHEYE, distortion=(0.02, -0.01, 0.003, 0.0)), as_colmap, ColmapDataParserConfig
-    ),
     "scannetpp-seeded": Layout(
         FISHEYE, Capture.write_scannetpp, SeededScanNetppDataParserConfig, frames=FRAMES - len(BAD)
     ),
@@ -66,8 +56,6 @@ LAYOUTS = {
 
 @dataclass
 class Trained:
-    """A capture on which splatfacto-cpu was trained."""
-
     capture: Capture
     layout: Layout
     run: Path
@@ -143,7 +131,6 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def own_scene(scene, tmp_path) -> Path:
-    """A copy to change."""
     return Path(shutil.copytree(scene, tmp_path / "scene"))
 
 
@@ -176,16 +163,24 @@ def test_without_points_training_starts_from_random_ones(own_scene, gone, capsys
     assert "starts from random ones" in " ".join(capsys.readouterr().out.split())
 
 
+def change(scene: Path, **values) -> None:
+    """Change entries of transforms.json; None removes one."""
+    meta = json.loads((scene / TRANSFORMS).read_text()) | values
+    (scene / TRANSFORMS).write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
+
+
+def frames_of(scene: Path) -> list[dict]:
+    return json.loads((scene / TRANSFORMS).read_text())["frames"]
+
+
 def spoil_pose(scene: Path) -> None:
-    meta = json.loads((scene / TRANSFORMS).read_text())
-    meta["frames"][4]["transform_matrix"][1][3] += 0.1
-    (scene / TRANSFORMS).write_text(json.dumps(meta))
+    frames = frames_of(scene)
+    frames[4]["transform_matrix"][1][3] += 0.1
+    change(scene, frames=frames)
 
 
 def mark_all(scene: Path) -> None:
-    meta = json.loads((scene / TRANSFORMS).read_text())
-    meta["frames"] = [{**frame, "is_bad": True} for frame in meta["frames"]]
-    (scene / TRANSFORMS).write_text(json.dumps(meta))
+    change(scene, frames=[{**frame, "is_bad": True} for frame in frames_of(scene)])
 
 
 def rename_photos(scene: Path) -> None:
@@ -202,10 +197,7 @@ def rename_photos(scene: Path) -> None:
         (lambda scene: (scene / "dslr/colmap/images.txt").unlink(), r"no images.bin or images.txt"),
         (lambda scene: (scene / "dslr/colmap/points3D.txt").write_text("1 2 3\n"), "points3D.txt: cannot be read"),
         (lambda scene: (scene / TRANSFORMS).unlink(), "transforms.json: no such file.*--data names"),
-        (
-            lambda scene: (scene / "dslr/resized_images/00001.png").unlink(),
-            "1 of 7 .* missing, first 00001.png",
-        ),
+        (lambda scene: (scene / "dslr/resized_images/00001.png").unlink(), "1 of 7 .* missing, first 00001.png"),
         (lambda scene: (scene / TRANSFORMS).write_text("{}"), "KeyError: 'frames'; expected JSON with frames"),
         (lambda scene: (scene / TRANSFORMS).write_text("{"), "transforms.json: JSONDecodeError"),
     ],
@@ -216,12 +208,6 @@ def test_what_cannot_be_used_is_named(own_scene, spoil, message):
         parsed(own_scene)
 
 
-def change(scene: Path, **values) -> None:
-    """Change entries of transforms.json; None removes one."""
-    meta = json.loads((scene / TRANSFORMS).read_text()) | values
-    (scene / TRANSFORMS).write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
-
-
 def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, capsys):
     """Official test scenes publish the poses of their test photos alone."""
     for number in HELD_OUT:
@@ -230,12 +216,10 @@ def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, c
     train, held_out = parsed(own_scene, skip_bad=False), parsed(own_scene, "test", skip_bad=False)
     assert len(numbers(held_out)) >= 1 and not {*numbers(train)} & {*numbers(held_out)}
     assert {*numbers(train), *numbers(held_out)} == {*range(FRAMES)} - {*HELD_OUT}
-    assert torch.equal(train.dataparser_transform, parsed(scene).dataparser_transform), (
-        "hidden poses count in the frame"
-    )
+    same = torch.equal(train.dataparser_transform, parsed(scene).dataparser_transform)
+    assert same, "hidden poses count in the frame"
     assert "photos of the test are hidden" in " ".join(capsys.readouterr().out.split())
-    meta = json.loads((scene / TRANSFORMS).read_text())
-    change(own_scene, frames=meta["frames"], test_frames=None)  # no lists either: every tenth is held out
+    change(own_scene, frames=frames_of(scene), test_frames=None)  # no lists either: every tenth is held out
     assert [len(numbers(parsed(own_scene, split, skip_bad=False))) for split in ("train", "test")] == [6, 1]
 
 

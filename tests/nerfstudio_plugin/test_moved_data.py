@@ -24,13 +24,11 @@ def runs(trained_walls, tmp_path) -> Path:
 
 @pytest.fixture
 def moved(wall_scene, tmp_path) -> Path:
-    """A folder to which the data of both was moved."""
     shutil.copytree(wall_scene.parent, tmp_path / "moved")
     return tmp_path / "moved"
 
 
 def keep_data_of(runs: Path, name: str, trained_walls: Path) -> None:
-    """Let one of the runs find its data."""
     shutil.copy(run_of(trained_walls, name) / "config.yml", run_of(runs, name) / "config.yml")
 
 

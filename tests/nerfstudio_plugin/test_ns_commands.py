@@ -35,7 +35,6 @@ WIDTH, HEIGHT, FIELD_OF_VIEW = 40, 30, 60.0
 
 
 def started(program: types.ModuleType, *words: object) -> None:
-    """Start one of nerfstudio's commands in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [program.__name__, *map(str, words)])
         patch.setattr(writer, "EVENT_WRITERS", [])  # those of trainings before in this process
@@ -99,7 +98,6 @@ def capture() -> Capture:
 
 @pytest.fixture(scope="module")
 def trained_by_ns_train(capture, tmp_path_factory) -> Callable[[str], Run]:
-    """A function that gives the run of a method."""
     folder = tmp_path_factory.mktemp("commands")
     capture.write_nerfstudio(folder / "capture")
     runs: dict[str, Run] = {}
@@ -191,7 +189,6 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def drawn(run: Run, way: str, folder: Path, *options: object) -> list[np.ndarray]:
-    """The pictures that ``ns-render`` makes."""
     words = ["--load-config", run.config, "--output-path", folder / "out", "--image-format", "png", *options]
     started(render, way, *words, "--output-format", "images")
     pictures = [pixels(path) for path in sorted((folder / "out").iterdir())]
@@ -219,13 +216,6 @@ def test_camera_path_draws_what_the_model_draws_and_no_other_lens(run: Run, capt
     assert len(pictures) == 2 and pictures[0].shape == (HEIGHT, WIDTH, 3)
     # 1/255: rounding to 8 bits, down
     assert all(np.abs(picture - expected).max() <= 1 / 255 + 1e-6 for picture in pictures)
-
-
-def test_interpolate_draws_between_the_photos(run: Run, tmp_path):
-    options = "--pose-source train --interpolation-steps 2 --downscale-factor 2"
-    pictures = drawn(run, "interpolate", tmp_path, *options.split())
-    assert len(pictures) == 14, "two between each two of eight photos"
-    assert np.abs(pictures[0] - pictures[6]).mean() > 0.02
 
 
 def test_dataset_puts_the_undistorted_photo_beside_each_render(trained_by_ns_train, tmp_path):

@@ -5,6 +5,7 @@ import sys
 import warnings
 from pathlib import Path
 
+from making import quick_start
 from pointsplat_ns.nerfstudio_plugin.registration import load_specification, quiet_nerfstudio
 
 OURS_FIRST = """
@@ -29,7 +30,8 @@ for found in (dataparsers.replica, dataparsers.scannetpp):
 def test_our_modules_may_be_imported_before_nerfstudio_and_need_no_network():
     # nerfstudio imports entry points from inside its own imports, so the order decides what is half imported. That
     # nerfstudio itself may come first is what every test that parses its command line proves.
-    result = subprocess.run([sys.executable, "-c", OURS_FIRST], capture_output=True, text=True, timeout=300)
+    words = [sys.executable, "-c", OURS_FIRST]
+    result = subprocess.run(words, capture_output=True, text=True, timeout=300, env=quick_start())
     assert result.returncode == 0, result.stderr
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from refusing import fails
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig, fuse_depth
@@ -17,7 +18,6 @@ from replica_scenes import CAMERA, line_of, write_scene
 
 @pytest.fixture()
 def row(tmp_path):
-    """Twelve frames, a unit apart."""
     return write_scene(tmp_path / "room", frames=12, step=1.0)
 
 
@@ -145,12 +145,10 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
     [
         (lambda scene: scene.rename(scene.with_name("none")), ["no traj.txt or traj_w_c.txt"]),
         (one_deeper, ["contains the scenes t: name one"]),
-        (removed("traj.txt"), ["no traj.txt or traj_w_c.txt"]),
         (removed("cam_params.json"), ["s/cam_params.json", "rooms/cam_params.json"]),
         (removed("results/frame000002.png"), ["4 poses for 3 photos"]),
         (camera("{"), ["JSONDecodeError", "cam_params.json"]),
         (camera("{}"), ["KeyError: 'camera'; expected {\"camera\""]),
-        (camera({"fy": None}), ["TypeError: "]),
         (camera({"fx": 10**400}), ["OverflowError: "]),
         (camera({"fx": -1.0}), ["'fx': -1.0", "with positive numbers"]),
         (camera({"scale": float("nan")}), ["'scale': nan"]),
@@ -166,9 +164,7 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
 )
 def test_what_is_missing_or_cannot_be_used_is_named_in_one_line(scene, spoil, words):
     spoil(scene)
-    with pytest.raises(DataError) as caught:
-        load_replica(scene)
-    assert all(some in str(caught.value) for some in words) and "\n" not in str(caught.value), caught.value
+    fails(lambda: load_replica(scene), *words, error=DataError)
 
 
 def test_pictures_of_another_kind_or_size_and_broken_ones_are_refused(scene):
@@ -209,9 +205,8 @@ def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(sc
     edit_line(scene, 2, lost)
     with caplog.at_level(logging.WARNING):
         loaded = load_replica(scene)
-    assert [int(path.stem[5:]) for path in loaded.photos] == [0, 2, 3] and np.isfinite(
-        loaded.poses.astype(np.float32)
-    ).all()
+    assert [int(path.stem[5:]) for path in loaded.photos] == [0, 2, 3]
+    assert np.isfinite(loaded.poses.astype(np.float32)).all()
     assert "1 of 4 poses" in caplog.text and "line 2" in caplog.text
 
 

@@ -27,10 +27,14 @@ SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
 
 
+QUICK_START = REPOSITORY / "tests" / "support" / "quick_start"
+"""First on the path of programs of nerfstudio that need not list the methods of others."""
+
+
 def quick_start() -> dict[str, str]:
     """The environment, for programs of nerfstudio that need not list the methods of others."""
-    paths = [str(REPOSITORY / "tests" / "support" / "quick_start"), os.environ.get("PYTHONPATH", "")]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    paths = filter(None, (str(QUICK_START), os.environ.get("PYTHONPATH")))
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def imports_of(path: Path) -> set[str]:
@@ -116,6 +120,13 @@ def ball(
         features_dc=bright + torch.sin(2 * place),
         features_rest=0.05 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
     )
+
+
+class Bomb:
+    """An object that prints when it is unpickled as usual."""
+
+    def __reduce__(self):
+        return (print, ("this must never be printed",))
 
 
 EYES = torch.tensor([[3.0, 0.0, 0.5], [2.6, 1.5, 0.5], [2.6, -1.5, 0.6]])

@@ -56,14 +56,7 @@ def used(device: torch.device | None = None) -> int:
 
 @pytest.mark.parametrize(
     ("count", "others", "threads"),
-    [
-        (16, 0.0, 16),
-        (16, 2.1, 14),
-        (16, 16.0, 1),
-        (2, 0.3, 2),
-        (2, 2 / 3, 1),
-        (2, 2.0, 1),
-    ],
+    [(16, 0.0, 16), (16, 2.1, 14), (16, 16.0, 1), (2, 0.3, 2), (2, 2 / 3, 1)],
 )
 def test_as_many_threads_are_used_as_other_programs_leave_cores(machine, count, others, threads):
     machine.count, machine.others_use = count, others

@@ -6,39 +6,10 @@ import shutil
 import subprocess
 
 import pytest
-import torch
 
-from pointsplat_ns.system.kernels import functions_of, structs_of
+from pointsplat_ns.system.kernels import structs_of
 from pointsplat_ns.system.native import INCLUDE, cpp_files
 
-SHARED = """
-struct Hidden {
-    bool not_shared;
-};
-
-extern "C" {
-
-// A comment; with a semicolon.
-struct Inner {
-    int32_t number;  // four bytes, then padding
-    double values[2][3];
-};
-
-struct Task {
-    Inner inner;
-    const float *a, *b;
-    int64_t count;
-};
-
-int pointsplat_size() { return 3; }
-
-void pointsplat_run(const Task* task, const int64_t* rows,
-                    int64_t count) {
-    if (task) return;
-}
-
-}  // extern "C"
-"""
 COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
 
 
@@ -57,15 +28,3 @@ def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
     check = tmp_path / "check.cpp"
     check.write_text("\n".join(lines) + "\n", "utf-8")
     subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)], check=True)
-
-
-def test_what_is_shared_is_declared_with_its_types():
-    structs = structs_of(SHARED)
-    assert [*structs] == ["Inner", "Task"]
-    assert structs["Inner"]._fields_ == [("number", ctypes.c_int32), ("values", ctypes.c_double * 6)]
-    fields = [("inner", structs["Inner"]), ("a", ctypes.c_void_p), ("b", ctypes.c_void_p), ("count", ctypes.c_int64)]
-    assert structs["Task"]._fields_ == fields and structs["Task"].pointers["a"].dtype == torch.float32
-    functions = functions_of(SHARED, structs)
-    assert functions["pointsplat_size"] == (ctypes.c_int, [])
-    result, (task, rows, count) = functions["pointsplat_run"]
-    assert result is None and task.dtype is None and rows.dtype == torch.int64 and count is ctypes.c_int64

@@ -16,7 +16,6 @@ class Terminal(io.StringIO):
 
 @pytest.fixture()
 def stderr(monkeypatch):
-    """A function that puts a stream in place of standard error."""
     for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "JPY_PARENT_PID"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TERM", "xterm")

@@ -15,7 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from broken_steps import broken
-from making import REPOSITORY, box_room, dense_config, quick_start, views_sampled_once
+from making import QUICK_START, REPOSITORY, box_room, dense_config, quick_start, views_sampled_once
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
@@ -72,7 +72,6 @@ def train(config, world_size: int = 1, judged: bool = False) -> dict:
 
 
 def saving(data: Path, output_dir: Path, steps: int):
-    """The config of a training that saves every second step."""
     config = config_of(data, output_dir, steps)
     config.steps_per_save, config.save_only_latest_checkpoint = 2, False
     return config
@@ -102,7 +101,6 @@ def two_scenes_a_step() -> Iterator[None]:
 
 
 def work(rank: int, folder: Path) -> None:
-    """What each of the two processes does."""
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
     found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2, judged=True)
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
@@ -119,7 +117,7 @@ def together(tmp_path_factory):
     write_rooms(folder / "rooms")
     pair = subprocess.Popen(
         [sys.executable, __file__, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, REPOSITORY / "tests/support")))},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (QUICK_START, REPOSITORY, QUICK_START.parent)))},
     )  # fmt: skip
     try:
         with two_scenes_a_step():

@@ -10,7 +10,6 @@ from unittest import mock
 import cv2
 import pytest
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA, pipeline_of, same, small_config
@@ -48,10 +47,7 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
     assert modes == [("classic", 3), ("antialiased", 1)]
 
 
-OTHERS = ({"size": "small"}, {"encoder": "concat"}, {"use_position": False}, {"norm": "batch"})
-
-
-@pytest.mark.parametrize("other", OTHERS, ids=str)
+@pytest.mark.parametrize("other", [{"size": "small"}, {"norm": "batch"}], ids=str)
 def test_weights_of_another_network_are_refused(trained, trained_walls, other):
     state = torch.load(next(trained[0].get_checkpoint_dir().iterdir()), weights_only=True)["pipeline"]
     with pytest.raises(SceneError, match="does not hold a network of size .* with encoder .*, use_appearance"):
@@ -86,7 +82,6 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"lpips_weight": -0.1}, "lpips-weight -0.1: expected a finite number, 0 or above"),
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
         ({"by": "merge", "opacity_weight": 0.3}, "opacity weight 0.3: merge does not weigh opacity"),
         ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
@@ -94,10 +89,19 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
         ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
         ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
+        ({"schedule": "step", "drop_at": 0.0}, "--drop-at 0"),
+        ({"global_norm": 0.0}, "--global-norm 0"),
+        ({"global_norm": math.nan}, "--global-norm nan"),
+        ({"rate_factor": -1.0}, "--rate-factor"),
+        ({"rate_factor": math.inf}, "--rate-factor"),
+        ({"seconds": 0.0}, "--seconds 0: expected a finite number above 0"),
+        ({"seconds": math.nan}, "--seconds nan: expected a finite number above 0"),
     ],
 )
 def test_contradictory_settings_are_refused(trained_walls, tmp_path, changes, message):
-    config = small_config(trained_walls, tmp_path / "outputs", 1, **changes)
+    config = small_config(trained_walls, tmp_path / "outputs", 1)
+    for name, value in changes.items():
+        setattr(config if hasattr(config, name) else config.pipeline.model, name, value)
     config.save_config()
     with pytest.raises(PointSplatError, match=message):
         config.setup(local_rank=0, world_size=1).setup()
@@ -146,9 +150,8 @@ def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
     for index, (name, seen) in enumerate((("wall-a", True), ("wall-b", False))):
         scene, block = evaluated.model.pruned_scene(index), found["scenes"][name]
         assert (block["views"], block["seen_in_training"]) == (2, seen)
-        assert block["seconds"].keys() == {"prune", "refine"} and block["dense"]["gaussians"] == len(
-            evaluated.datamanager.scenes[index].read_dense()
-        )
+        assert block["seconds"].keys() == {"prune", "refine"}
+        assert block["dense"]["gaussians"] == len(evaluated.datamanager.scenes[index].read_dense())
         assert block["pruned"]["gaussians"] == block["refined"]["gaussians"] == len(scene.pruned)
         assert block["pruned"]["megabytes"] == pytest.approx(scene.pruned.megabytes)
         assert all(block[v]["fps"] > 0 and 0 < block[v]["ssim"] <= 1 for v in VARIANTS)
@@ -169,16 +172,6 @@ def test_a_report_has_sizes_quality_and_speed_of_each_scene(evaluated, report):
     assert not evaluated.training and not evaluated.model.training, "the model is left as it was"
     assert sorted(path.name for path in folder.iterdir()) == [f"wall-{s}_000{i}.png" for s in "ab" for i in (0, 1)]
     assert cv2.imread(str(folder / "wall-a_0000.png")).shape == (48, 4 * 64, 3), "photo, dense, pruned, refined"
-
-
-def test_a_distorted_scene_of_degree_0_is_judged_as_its_own_run_judges_it(lens_run, no_lpips):
-    own = eval_setup(lens_run / "config.yml")[1].get_average_eval_image_metrics()
-    pipeline = pipeline_of(lens_run)
-    assert pipeline.datamanager.scenes[0].read_dense().sh_degree == 0
-    report = pipeline.get_average_eval_image_metrics()
-    # dB; float32 rounding, for a colour logit has become a SH coefficient of the same colour
-    assert report["average"]["dense"]["psnr"] == pytest.approx(own["psnr"], abs=1e-3)
-    assert not torch.equal(pipeline.datamanager.scenes[0].run.transform, torch.eye(4)[:3]), "proves too little"
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0])

@@ -11,7 +11,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import equal, small_config
 from pointsplat_ns.compression.trained_refiner import load_refiner
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.presets import authors_config, paper_config
 from pointsplat_ns.refiner import Refiner
@@ -25,27 +24,16 @@ FIELDS = {
     "max_num_iterations": (10_000, 10_000),
     "schedule": ("step", "step"),
     "drop_at": (0.6, 0.7),
-    "rate_factor": (1.0, 1.0),
     "global_norm": (None, 2.0),
-    "seconds": (None, None),
-    "pipeline.datamanager.supervision": ("photos", "photos"),
     "pipeline.datamanager.images_per_step": (2, 2),
     "pipeline.model.by": ("paper", "authors"),
-    "pipeline.model.opacity_weight": (0.3, 0.3),
     "pipeline.model.keep": (0.3, 0.3),
-    "pipeline.model.more_keeps": ((), ()),
-    "pipeline.model.augment": (False, False),
-    "pipeline.model.size": ("full", "full"),
-    "pipeline.model.encoder": ("dual", "dual"),
-    "pipeline.model.use_appearance": (True, True),
-    "pipeline.model.use_position": (True, True),
     "pipeline.model.raw_inputs": (True, True),
     "pipeline.model.norm": ("batch", "batch"),
     "pipeline.model.enc_depths": (None, (2, 2, 2, 6, 2)),
     "pipeline.model.stem": ("conv", "linear"),
     "pipeline.model.means_reach": (1.0, 1.0),
     "pipeline.model.train_encoder": (True, False),
-    "pipeline.model.pixel_loss": ("l1", "l1"),
     "pipeline.model.lpips_weight": (0.1, 0.1),
     "pipeline.model.lpips_net": ("vgg", "vgg"),
 }
@@ -74,7 +62,6 @@ def test_each_field_of_a_preset_is_that_of_its_source(name, column):
 
 
 def small(name, data, output_dir):
-    """A preset at a size for tests."""
     config = PRESETS[name]()
     config.machine.device_type = "cpu"
     config.output_dir, config.max_num_iterations, config.experiment_name = output_dir, 2, "refiner"
@@ -116,12 +103,8 @@ def test_a_preset_trains_and_its_run_and_weights_open_again(trained_walls, run_t
     for opened in (load_refiner(config.get_base_dir()).network, load_refiner(weights).network, again.model.refiner):
         assert opened.config == refiner.config and equal(opened.state_dict(), refiner.state_dict())
     about = read_metadata(weights)
-    assert {key: about[key] for key in ("method_name", "drop_at", "global_norm", "train_encoder")} == {
-        "method_name": config.method_name,
-        "drop_at": config.drop_at,
-        "global_norm": config.global_norm,
-        "train_encoder": name == "paper",
-    }
+    assert all(about[key] == getattr(config, key) for key in ("method_name", "drop_at", "global_norm"))
+    assert about["train_encoder"] == (name == "paper")
 
 
 def test_one_norm_limits_all_gradients_together(trained_walls, tmp_path):
@@ -140,19 +123,3 @@ def test_one_norm_limits_all_gradients_together(trained_walls, tmp_path):
     total = sum(norm**2 for norm in free.values()) ** 0.5
     assert total > 2e-3 and sum(norm > 0 for norm in free.values()) > 3
     assert limited == pytest.approx({name: norm * 1e-3 / total for name, norm in free.items()}, rel=1e-3, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"drop_at": 0.0}, "--drop-at 0"),
-        ({"global_norm": 0.0}, "--global-norm 0"),
-        ({"global_norm": float("nan")}, "nan"),
-    ],
-)
-def test_settings_out_of_range_are_refused(changes, said):
-    config = paper_config()
-    for name, value in changes.items():
-        setattr(config, name, value)
-    with pytest.raises(PointSplatError, match=said):
-        config.setup(local_rank=0, world_size=1)

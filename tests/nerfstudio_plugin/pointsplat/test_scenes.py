@@ -54,9 +54,8 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(wall_config, wa
     run = make_run(tmp_path, wall_config, wall_scene)
     config = run / "config.yml"
     text = config.read_text()
-    config.write_text(
-        text.replace("pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig", "json.JSONDecoder")
-    )
+    parser = "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
+    config.write_text(text.replace(parser, "json.JSONDecoder"))
     with pytest.raises(SceneError, match="config.yml: trained with the dataparser json.JSONDecoder.*not installed"):
         dataparser_of(open_run(run))
     config.write_text(text.replace("frame_stride: 1", "frame_stride: 1\n      an_option_of_then: null"))
@@ -64,9 +63,7 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(wall_config, wa
     config.write_text(text.replace("frame_stride:", "frame_leap:"))
     with mock.patch("pointsplat_ns.nerfstudio_plugin.pointsplat.scenes.CONSOLE.log") as log:
         assert dataparser_of(open_run(run)).config.frame_stride == 1
-    assert log.call_args.args[0].endswith(
-        "config.yml: settings that its dataparser no longer has are left out: frame_leap"
-    )
+    assert log.call_args.args[0].endswith("settings that its dataparser no longer has are left out: frame_leap")
 
 
 def test_code_in_a_config_is_never_run(wall_config, wall_scene, tmp_path):

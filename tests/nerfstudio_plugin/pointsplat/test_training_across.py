@@ -1,7 +1,6 @@
 """Training across scenes without photos: dense supervision, exact resuming, rates and schedules."""
 
 import json
-import math
 import shutil
 from pathlib import Path
 from unittest import mock
@@ -11,13 +10,11 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
-from broken_steps import broken
-from making import dense_config, equal
+from making import dense_config
 
 
 @pytest.fixture(scope="module")
 def trained(three_rooms, run_training, tmp_path_factory):
-    """A short training on two of the rooms: its config and trainer."""
     config = dense_config(three_rooms, tmp_path_factory.mktemp("refined"), steps=16)
     for group in config.optimizers.values():
         group["optimizer"].lr *= 10  # tests take few steps
@@ -67,29 +64,6 @@ def test_the_loss_is_against_the_dense_scene_even_where_there_are_photos(trained
         losses[supervision] = float(pipeline.get_train_loss_dict(0)[1]["l1"].detach())
     # an untrained refiner that keeps all is the dense scene, but for the rounding of its renders to 8 bits
     assert losses["dense"] < 0.5 / 255 and losses["photos"] > 5 / 255
-
-
-def test_an_interrupted_training_resumes_as_an_unbroken_one(three_rooms, run_training, tmp_path):
-    stop, schedule, skipped = 4, "step", {1, 4, 6}
-
-    def config(name, steps):
-        changed = dense_config(three_rooms, tmp_path / name, steps)
-        changed.schedule = schedule
-        changed.steps_per_save, changed.save_only_latest_checkpoint = stop, False
-        return changed
-
-    with broken("nan", skipped):
-        whole, losses = run_training(config("whole", 8))
-        rest = config("rest", 8 - stop - 1)
-        rest.load_dir, rest.load_step = whole.checkpoint_dir, stop
-        resumed, last_losses = run_training(rest)
-    assert [math.isnan(loss) for loss in losses] == [step in skipped for step in range(8)] and len(set(losses)) == 8
-    assert str(last_losses) == str(losses[stop + 1 :])
-    one, other = whole.pipeline, resumed.pipeline
-    assert (whole.skipped.total(), resumed.skipped.total()) == (3, 1)
-    assert equal(one.model.refiner.state_dict(), other.model.refiner.state_dict())
-    rates = [t.optimizers.optimizers["means"].param_groups[0]["lr"] for t in (whole, resumed)]
-    assert rates[0] == rates[1]
 
 
 def test_random_choices_after_resuming_are_those_of_an_unbroken_run(three_rooms):

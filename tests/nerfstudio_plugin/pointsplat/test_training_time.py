@@ -79,11 +79,3 @@ def test_resumed_training_ends_as_an_unbroken_one(three_rooms, run_training, tmp
     # one that has taken its time has none left
     with pytest.raises(PointSplatError, match=r"--seconds 80: the training has taken 80 s .* expected more"):
         timed(three_rooms, tmp_path, 80.0, load_dir=resumed.checkpoint_dir).setup(local_rank=0, world_size=1).setup()
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
-def test_a_time_that_is_none_is_an_error(three_rooms, tmp_path, seconds):
-    config = timed(three_rooms, tmp_path, seconds)
-    config.save_config()
-    with pytest.raises(PointSplatError, match=f"--seconds {seconds:g}: expected a finite number above 0"):
-        config.setup(local_rank=0, world_size=1).setup()

@@ -1,13 +1,10 @@
 """What makes a training vary (budgets, transforms, rates that fit)."""
 
-import math
-
 import pytest
 import torch
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import move_zero_layers, small_config
-from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 
 
@@ -44,13 +41,10 @@ def test_transforms_change_what_the_network_sees_and_nothing_else(trained_walls,
     assert moved == again, "the same seed draws the same transforms"
 
 
-def test_the_factor_multiplies_every_rate_and_is_a_positive_number(trained_walls, tmp_path):
+def test_the_factor_multiplies_every_rate(trained_walls, tmp_path):
     config = small_config(trained_walls, tmp_path, 1)
     config.rate_factor = 3.0
     trainer = config.setup(local_rank=0, world_size=1)
     for name, group in trainer.config.optimizers.items():
         assert group["optimizer"].lr == pytest.approx(3 * REFINER_RATES[name])
     assert config.optimizers["encoder"]["optimizer"].lr == REFINER_RATES["encoder"], "the config given is left as it is"
-    for config.rate_factor in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(PointSplatError, match="--rate-factor"):
-            config.setup(local_rank=0, world_size=1)

@@ -141,7 +141,6 @@ def broken(kind: str, steps: range) -> Iterator[None]:
 
 
 def state_of(trainer):
-    """Parameters, the optimisers' moments and what densification has gathered."""
     optimizers = {name: o.state_dict()["state"] for name, o in trainer.optimizers.optimizers.items()}
     model = trainer.pipeline.model
     parameters = {name: value.detach() for name, value in model.gauss_params.items()}
@@ -150,7 +149,6 @@ def state_of(trainer):
 
 @pytest.fixture()
 def started(wall_scene, wall_config, tmp_path):
-    """A trainer before its first step."""
     torch.manual_seed(0)
     config = wall_config(wall_scene, tmp_path, 20)
     config.pipeline.model.warmup_length = 2  # densification in the eleventh step, before schedules are fitted
@@ -160,7 +158,6 @@ def started(wall_scene, wall_config, tmp_path):
 
 
 def take(trainer, steps) -> list[dict]:
-    """Take steps as nerfstudio's trainer does; the metrics of each."""
     found = []
     for step in steps:
         trainer.step = step

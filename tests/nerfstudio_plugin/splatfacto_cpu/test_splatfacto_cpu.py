@@ -154,7 +154,6 @@ def test_black_seeds_start_from_random_colours_that_can_be_trained():
 
 @pytest.fixture(scope="module")
 def trained(wall_scene, wall_config, run_training, tmp_path_factory):
-    """A short run on the painted wall: its config, its trainer and its losses."""
     config = wall_config(wall_scene, tmp_path_factory.mktemp("outputs"), steps=50)
     return config, *run_training(config)
 
