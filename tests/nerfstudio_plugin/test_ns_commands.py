@@ -218,6 +218,13 @@ def test_camera_path_draws_what_the_model_draws_and_no_other_lens(run: Run, capt
     assert all(np.abs(picture - expected).max() <= 1 / 255 + 1e-6 for picture in pictures)
 
 
+def test_interpolate_draws_between_the_photos(run: Run, tmp_path):
+    options = "--pose-source train --interpolation-steps 2 --downscale-factor 2"
+    pictures = drawn(run, "interpolate", tmp_path, *options.split())
+    assert len(pictures) == 14, "two between each two of eight photos"
+    assert np.abs(pictures[0] - pictures[6]).mean() > 0.02
+
+
 def test_dataset_puts_the_undistorted_photo_beside_each_render(trained_by_ns_train, tmp_path):
     run = trained_by_ns_train("splatfacto-cpu")
     words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
