@@ -20,7 +20,10 @@ from pointsplat_ns.io.files import bytes_text
 UNSAID = ("inf", "nan", "told", "beyond", "closer in", "no difference", "Traceback")
 """Words that no screen and no page has."""
 
-LINE = r"(?:[\d.]+ (?:-> [\d.]+ )?dB in \d+ .*photos.*; .*)?(?:more than )?[\d.]+ dB, SSIM \d\.\d\d(?:: .*| against the dense scene)?"
+LINE = (
+    r"(?:[\d.]+ (?:-> [\d.]+ )?dB in \d+ .*photos.*; .*)?"
+    r"(?:more than )?[\d.]+ dB, SSIM \d\.\d\d(?:: .*| against the dense scene)?"
+)
 """The line of quality."""
 
 
