@@ -64,21 +64,22 @@ def fastest_within(points: Sequence[Point], loss: float, trusted: bool = True) -
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
     """The fastest point that loses at most ``within`` dB, and a text on it. The first point is the dense scene; if it
-    is the fastest, the text has the figures of the next best too. ``trusted`` as for :func:`fastest_first`."""
+    is the fastest, the text has the figures of the best of the others too. ``trusted`` as for :func:`fastest_first`."""
     dense = points[0]
     best, other = fastest_within(points, within, trusted), next_best(points)
     if dense.against_photos is not None:
-        limit, estimated = f"loses at most {within:g} dB against held-out photos", ""
+        limit = f"loses at most {within:g} dB against held-out photos"
+        value = "" if other is None else f"loses {loss_of(other, dense):.2f} dB"
     else:
-        limit = f"has at least {psnr_within(within):.1f} dB against the dense scene's renders"
-        limit, estimated = f"{limit} (about {within:g} dB lost against photos)", " (estimated)"
+        limit = f"has {psnr_within(within):.1f} dB against the dense scene"
+        limit += f", as a loss of {within:g} dB against photos needs"
+        value = "" if other is None else f"has {other.against_dense.psnr:.1f} dB"
     if best is not dense:
         what = "fastest point" if trusted else "point with the fewest Gaussians"
         return best, f"the {what} that {limit}: {best.label}, {_figures(best, dense, trusted)}"
-    why = f"no point that {'is faster' if trusted else 'has fewer Gaussians'} than the dense scene {limit}"
+    why = f"no {'faster' if trusted else 'smaller'} point {limit}"
     if other is not None:
-        why += f"; the next best, {other.label}, loses {loss_of(other, dense):.2f} dB{estimated}: "
-        why += f"{_figures(other, dense, trusted)}, made in {other.seconds:.0f} s"
+        why += f"; the best, {other.label}, {value}: {_figures(other, dense, trusted)}, made in {other.seconds:.0f} s"
     return dense, why
 
 
