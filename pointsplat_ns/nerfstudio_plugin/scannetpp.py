@@ -112,7 +112,7 @@ class SeededScanNetpp(ScanNetpp):
     ) -> dict[str, Tensor]:
         """The points of a COLMAP model in the frame of the outputs."""
         if not folder.is_dir() or not (points := _read(folder, "points3D").values()):
-            CONSOLE.log(f"{folder}: no points of COLMAP, so no seed points, and a training starts from random ones")
+            CONSOLE.log(f"{folder}: no points of COLMAP, so no seed points")
             return {}
         move = _frame_of(
             folder, {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}

@@ -154,13 +154,13 @@ def test_bad_frames_are_left_out_of_both_splits_with_their_masks_and_cameras(sce
 
 
 @pytest.mark.parametrize("gone", ["folder", "points"])
-def test_without_points_training_starts_from_random_ones(own_scene, gone, capsys):
+def test_without_points_there_are_no_seed_points_and_a_line_says_so(own_scene, gone, capsys):
     if gone == "folder":
         shutil.rmtree(own_scene / "dslr/colmap")
     else:
         (own_scene / "dslr/colmap/points3D.txt").write_text("# none\n")
     assert "points3D_xyz" not in parsed(own_scene).metadata
-    assert "starts from random ones" in " ".join(capsys.readouterr().out.split())
+    assert "so no seed points" in " ".join(capsys.readouterr().out.split())
 
 
 def change(scene: Path, **values) -> None:

@@ -93,7 +93,7 @@ class ReplicaDataParser(DataParser):
 
     def _seed_points(self, train: ReplicaScene) -> dict[str, torch.Tensor]:
         if train.depths is None:
-            CONSOLE.log(f"{train.folder}: no depth image of every photo, so training starts from random points")
+            CONSOLE.log(f"{train.folder}: no depth image of every photo, so no seed points")
             return {}
         xyz, rgb = fuse_depth(train, self.config.num_seed_points)
         if len(xyz) == 0:
