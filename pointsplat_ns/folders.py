@@ -29,6 +29,7 @@ from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequ
 from pointsplat_ns.compression.target_search import compact_to_psnr
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
 from pointsplat_ns.io.files import (
     content_hash,
@@ -276,10 +277,11 @@ class _Compacting:
                     "name another folder, or overwrite it with --force"
                 )
             finished = record is not None and whole and record["key"] == key
-            result = _known(task) if finished else self._make(task, source.bytes, key, start)
+            if not finished:
+                return self._make(task, source.bytes, key, start)
             if self.drawn and not pair_of(task.output).exists():
-                self._draw(task)
-            return result
+                self._draw(task, read_scene(task.source), read_scene(task.output))
+            return _known(task)
         except Exception as error:  # one scene must not stop the others
             kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
             return task.result("failed", seconds=time.perf_counter() - start, error=kind + one_line(error, limit=1000))
@@ -299,7 +301,8 @@ class _Compacting:
         judge = None if same and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
         with replacing(task.output) as part:
             save_as(kind, scene, part, name=task.output)
-            psnr = math.inf if judge is None else judge.psnr(read_back(scene, part, kind))[0]
+            written = read_back(scene, part, kind)
+            psnr = math.inf if judge is None else judge.psnr(written)[0]
             done = task.result(
                 "done",
                 before=len(dense), after=len(scene),
@@ -312,11 +315,12 @@ class _Compacting:
                 old.unlink(missing_ok=True)
             proofs = {"key": key, "options": self.options, "sha256": content_hash(part)}
             write_json({**dataclasses.asdict(done), **proofs}, task.record)
+        if self.drawn:
+            self._draw(task, dense, written)
         return done
 
-    def _draw(self, task: _Task) -> None:
+    def _draw(self, task: _Task, before: Gaussians, after: Gaussians) -> None:
         """Draw a scene and its result to a file; nothing if nothing of the scene is visible."""
-        before, after = read_scene(task.source), read_scene(task.output)
         after = after if after.offset is None else after.at_offset(before.offset)
         known = view_source(before, run=task.source, data=self.data).known(VIEW_COUNTS.opening)
         with suppress(DataError):
