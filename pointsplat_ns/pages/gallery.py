@@ -17,10 +17,9 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.pages.film import with_labels
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import picture_uri, read_png
+from pointsplat_ns.pages.pictures import picture_uri, read_png, with_labels
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
@@ -82,7 +81,7 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
         before, after = _sizes(result)
         row, column = divmod(index, columns)
         small = pair[: height * step : step, ::step][:, :width]
-        labelled = with_labels(small, (f"{result.name}: {before}", after), width // 2)
+        labelled = with_labels(small, (f"{result.name}: {before}", after))
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = labelled
     write_picture(torch.from_numpy(sheet) / 255, path)
 

@@ -1,15 +1,15 @@
-"""Videos, also of two scenes side by side."""
+"""Frames as videos, folders and pictures: whole, or nothing."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pointsplat_ns as ps
-from making import cloud, decoded
+from making import decoded
 from pointsplat_ns.pages import video
-from pointsplat_ns.pages.film import to_uint8, wiped, with_labels
-from pointsplat_ns.pages.video import write_frames
+from pointsplat_ns.pages.video import check_output
 
 
 def drawn(count: int = 6, width: int = 128, height: int = 96) -> list[np.ndarray]:
@@ -21,6 +21,10 @@ def drawn(count: int = 6, width: int = 128, height: int = 96) -> list[np.ndarray
         .astype(np.uint8)
         for i in range(count)
     ]
+
+
+def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float, force: bool = False) -> int:
+    return video.write_frames(frames, path, check_output(path, force), fps)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -88,15 +92,16 @@ def test_nothing_is_overwritten_unasked(name, tmp_path):
 def test_folders_of_others_are_left_alone(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.png").touch()
-    with pytest.raises(ps.SceneError, match="holds cat.png; expected a new folder"):
-        write_frames(drawn(1), tmp_path / "photos", 12, force=True)
     (tmp_path / "file").touch()
-    with pytest.raises(ps.SceneError, match="expected a new folder"):
-        write_frames(drawn(1), tmp_path / "file", 12, force=True)
-    with pytest.raises(ps.SceneError, match="cannot write a .avi file"):
-        write_frames(drawn(1), tmp_path / "film.avi", 12)
-    with pytest.raises(ps.SceneError, match="cannot be written"):
-        write_frames(drawn(1), tmp_path / "file" / "film.mp4", 12)
+    refused = {
+        "photos": "holds cat.png; expected a new folder",
+        "file": "expected the name of a folder",
+        "film.avi": "cannot write a .avi file",
+        "file/film.mp4": "cannot be written",
+    }
+    for name, words in refused.items():
+        with pytest.raises(ps.SceneError, match=words):
+            check_output(tmp_path / name, force=True)
 
 
 def test_missing_encoder_is_named(tmp_path, monkeypatch):
@@ -104,24 +109,3 @@ def test_missing_encoder_is_named(tmp_path, monkeypatch):
     with pytest.raises(ps.SceneError, match="has no h264_of_nobody; expected its wheel"):
         write_frames(drawn(1), tmp_path / "film.mp4", 12)
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("column", [0, 33, 70])
-def test_each_side_of_a_wipe_is_the_render_of_its_scene(column):
-    first = cloud(300)
-    second = first.replace(features_dc=-first.features_dc)
-    view = ps.sample_views(first, 1, 70, 44)[0]
-    shown = wiped([first, second], view, column)
-    left, right = (to_uint8(ps.render(scene, view)) for scene in (first, second))
-    for pixels, part in ((left, slice(0, max(column - 2, 0))), (right, slice(min(column + 2, 70), None))):
-        assert np.array_equal(shown[:, part], pixels[:, part]), "all but the line"
-    assert (shown[:, min(column, 69)] == 255).all() == (column == 33)
-
-
-def test_labels_stand_at_the_top_of_their_sides():
-    blank = np.full((200, 400, 3), 128, np.uint8)
-    both = with_labels(blank, ["dense", "ein Zehntel, 小"], 200) != 128
-    assert both[:40, :200].any() and both[:40, 200:].any() and not both[40:].any()
-    assert not (with_labels(blank, ["", "second"], 200)[:, :200] != 128).any()
-    narrow = with_labels(blank, ["first", "second"], 30) != 128
-    assert not narrow[:, :200].any() and narrow[:, 200:].any(), "no room on the left"
