@@ -58,12 +58,12 @@ def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> Non
     scenes = [_facts(result, path) for result in results]
     done = [result for result in results if result.megabytes is not None]
     sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
-    text = page(
+    html = page(
         "gallery.html", title=title, scenes=scenes, done=len(done), width=2 * WIDTH, height=HEIGHT,
         sizes=[bytes_text(1e6 * size) for size in sizes],
     )  # fmt: skip
     with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(html)
 
 
 def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:

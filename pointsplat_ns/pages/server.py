@@ -85,11 +85,6 @@ class Server(ThreadingHTTPServer):
         """Address of the page."""
         threading.Thread(target=self.serve_forever, name="serving", daemon=True).start()
 
-    def close(self) -> None:
-        """Stop to listen."""
-        self.shutdown()
-        self.server_close()
-
     def server_bind(self) -> None:
         """Bind without a look-up of the machine's name, which may take seconds."""
         TCPServer.server_bind(self)
@@ -117,16 +112,10 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 30  # s without a byte from a client
     server_version, sys_version = "pointsplat", ""
 
-    def do_GET(self) -> None:
-        self._serve()
-
-    def do_POST(self) -> None:
-        self._serve()
-
     def log_message(self, *_: object) -> None:
         """Requests are not logged."""
 
-    def _serve(self) -> None:
+    def do_GET(self) -> None:
         answer = self._answer()
         self.send_response(answer.status)
         headers = {
@@ -144,6 +133,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         for start in range(0, len(answer.body), 1 << 20):  # the time limit holds for each piece
             self.wfile.write(answer.body[start : start + (1 << 20)])
+
+    do_POST = do_GET
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)
@@ -168,11 +159,6 @@ class _Handler(BaseHTTPRequestHandler):
             return Answer(text.encode(), status=http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         try:
             return route.answer(Request(options, int(length), cast(BinaryIO, self.rfile)))
-        except (
-            ValueError,
-            TypeError,
-            KeyError,
-            OverflowError,
-            RecursionError,
-        ):  # a body that no page of this server sends
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+            # A body that no page of this server sends.
             return Answer(status=http.HTTPStatus.BAD_REQUEST)

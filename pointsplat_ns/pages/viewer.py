@@ -115,7 +115,8 @@ class Viewer:
         """End the server and all drawing. A second call does nothing."""
         if self._server.fileno() < 0:
             return
-        self._server.close()
+        self._server.shutdown()
+        self._server.server_close()
         # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
         for lock in (self._working, self._dropping):
             lock.acquire(timeout=5.0)  # s
@@ -138,7 +139,8 @@ class Viewer:
         wanted, stage = json.loads(request.body.read(request.length)), self._stage
         if stage is None or wanted["stage"] != stage.number:
             return Answer(status=HTTPStatus.CONFLICT)
-        index, percent, have = int(wanted["scene"]), _percent(wanted["percent"]), str(wanted["have"])
+        index, percent, have = int(wanted["scene"]), round(wanted["percent"]), str(wanted["have"])
+        percent = min(max(percent, 1), 100)
         viewed = dict(enumerate(stage.scenes))[index]
         if not have:
             viewed.stop()
@@ -174,11 +176,10 @@ class Viewer:
 def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
     """The page, with scenes that it asks this server for; without a flight it only takes a file."""
     scripts = (*((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()), *(("drop.js",) if drops else ()))
-    text = page(
-        "scene.html", scripts, with_workers=True, connects=True, title=title, flight=flight, live=True,
-        drops=READABLE_NAMES if drops else (), notes=(), missing="", data={"flight": flight},
+    return page(
+        "scene.html", scripts, ("worker-src blob:", "connect-src 'self'"), title=title, flight=flight, live=True,
+        drops=READABLE_NAMES if drops else (), notes=(), missing="",
     )  # fmt: skip
-    return text.encode("utf-8")
 
 
 def _receive(request: Request, path: Path, suffix: str) -> None:
@@ -198,11 +199,6 @@ def _receive(request: Request, path: Path, suffix: str) -> None:
                 raise ValueError("the body is cut off")
             stream.write(data)
             left -= len(data)
-
-
-def _percent(value: Any) -> int:
-    """A share of the Gaussians, 1 to 100 percent."""
-    return min(max(round(value), 1), 100)
 
 
 def _refused(text: str) -> Answer:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import before_pages_load, chromium, complaints, phone_and_colours
+from browser import chromium, complaints, phone_and_colours
 from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
@@ -162,22 +162,6 @@ def test_drags_move_what_is_seen_with_the_pointer(opened, drag):
     level = [abs(np.dot(state["right"], opened.execute_script("return flight.camera.up"))) for state in (start, after)]
     assert level[1] == pytest.approx(level[0], abs=1e-6), "the horizon stays level"
     settle(opened)
-
-
-def test_a_browser_without_floats_draws_the_same(browser, written, opened):
-    expected = picture(opened)
-    without = """
-      const original = WebGL2RenderingContext.prototype.getExtension;
-      WebGL2RenderingContext.prototype.getExtension = function (name) {
-        return name.includes("float") ? null : original.call(this, name);
-      };"""
-    with before_pages_load(browser, without):
-        browser.get(written.as_uri())
-        shrink(browser)
-        plain = picture(browser)
-        assert browser.execute_script("return flight.drawer.format === flight.drawer.gl.RGBA8")
-    # Sums of 8-bit numbers are rounded at each Gaussian.
-    assert ps.psnr(plain, expected) > 35
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbled", "another", "no base64"])

@@ -81,15 +81,12 @@ def keep(browser, index: int, percent: int) -> None:
     browser.execute_script(script, browser.find_elements(By.CSS_SELECTOR, "[data-kept]")[index], percent)
 
 
-def test_a_browser_without_webgl_says_so(page):
-    without = """const original = HTMLCanvasElement.prototype.getContext;
-      HTMLCanvasElement.prototype.getContext = function (name, ...rest) {
-        return name === "webgl2" ? null : original.call(this, name, ...rest);
-      };"""
+def test_a_browser_without_webgl_or_its_floats_says_so(page):
     address = page.current_url
-    with before_pages_load(page, without):
-        page.get(address)
-        waited(lambda: "This browser offers no WebGL 2" in text_of(page), "what is missing")
+    for owner, function in (("HTMLCanvasElement", "getContext"), ("WebGL2RenderingContext", "getExtension")):
+        with before_pages_load(page, f"{owner}.prototype.{function} = () => null;"):
+            page.get(address)
+            waited(lambda: "This browser offers no WebGL 2" in text_of(page), "what is missing")
     page.get(address)
     waited(lambda: still(page), "a picture")
     shrink(page)
