@@ -32,14 +32,10 @@ PHOTO_SIDE = 960
 class FilmSettings:
     """Settings of a film; the scene decides those that are None."""
 
-    width: int | None = None
-    """Width of a picture, pixels."""
+    width: int | None = None  # of a picture, pixels
     height: int | None = None
-    """Height of a picture, pixels."""
-    fps: float = 24.0
-    """Frames a second."""
-    seconds: float | None = None
-    """Length of the film."""
+    fps: float = 24.0  # frames a second
+    seconds: float | None = None  # length of the film
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

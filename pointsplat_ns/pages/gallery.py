@@ -12,7 +12,6 @@ from urllib.parse import quote
 import numpy as np
 import torch
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.io.pictures import write_picture
@@ -88,20 +87,13 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
 
 def _pair(result: SceneResult) -> np.ndarray | None:
     """The pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
-    try:
-        return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
-    except DataError:
-        return None
+    return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:
-    """Count and size before and after."""
-    before, after = (
-        ", ".join(
-            ([] if count is None else [f"{count:,} Gaussians"]) + ([] if size is None else [bytes_text(1e6 * size)])
-        )
-        for count, size in ((result.before, result.megabytes_before), (result.after, result.megabytes))
-    )
+    """Count and size before and after; a record that somebody changed may lack them."""
+    known = (result.before, result.megabytes_before), (result.after, result.megabytes)
+    before, after = (f"{count or 0:,} Gaussians, {bytes_text(1e6 * (size or 0.0))}" for count, size in known)
     return before, after
 
 

@@ -25,10 +25,8 @@ class Level:
     """A scene at a share of its Gaussians."""
 
     scene: Gaussians
-    how: str
-    """Text on the way it was made, which follows the count."""
-    spz: bytes = b""
-    """The scene for pages, once one has asked for it."""
+    how: str  # text on the way it was made, which follows the count
+    spz: bytes = b""  # the scene for pages, once one has asked for it
 
 
 class MergingStopped(Exception):

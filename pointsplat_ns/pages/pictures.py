@@ -11,9 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import one_line
-
 
 def to_uint8(picture: Tensor) -> np.ndarray:
     """A picture (H, W, 3) in [0, 1] as uint8."""
@@ -47,22 +44,16 @@ def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
     return np.asarray(image)
 
 
-def read_png(path: Path, width: int, height: int) -> np.ndarray:
-    """The pixels of a PNG file, (height, width, 3) uint8. The size is checked before the pixels are read. Raises
-    DataError if the file is missing, not a PNG, damaged, or of another size."""
-    from PIL import Image, UnidentifiedImageError
+def read_png(path: Path, width: int, height: int) -> np.ndarray | None:
+    """The pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG, damaged, or of another
+    size, which is checked before the pixels are read."""
+    from PIL import Image
 
-    expected = f"expected a PNG picture of {width} x {height} pixels"
     try:
         with Image.open(path, formats=["PNG"]) as picture:
-            if picture.size != (width, height):
-                raise DataError(f"{path}: has {picture.width} x {picture.height} pixels; {expected}")
-            return np.asarray(picture.convert("RGB"))
-    except UnidentifiedImageError as error:
-        raise DataError(f"{path}: not a PNG picture; {expected}") from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        found = error.strerror if isinstance(error, OSError) and error.strerror else one_line(error)
-        raise DataError(f"{path}: cannot be read ({found}); {expected}") from error
+            return np.asarray(picture.convert("RGB")) if picture.size == (width, height) else None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
 
 
 def picture_uri(pixels: np.ndarray) -> str:

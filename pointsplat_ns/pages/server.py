@@ -25,12 +25,9 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 class Request:
     """A request to a route."""
 
-    options: Mapping[str, str]
-    """What follows "?" in its address."""
-    length: int
-    """Size of its body, bytes."""
-    body: BinaryIO
-    """What the client sends; empty reads if it sends less than it said."""
+    options: Mapping[str, str]  # what follows "?" in its address
+    length: int  # of its body, bytes
+    body: BinaryIO  # reads are empty if the client sends less than it said
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,7 @@ class Route:
     """A path of the server."""
 
     answer: Callable[[Request], Answer]
-    largest: int = 0
-    """Largest body, bytes; 0 for requests without one, which get pages."""
+    largest: int = 0  # body, bytes; 0 for requests without one, which get pages
 
 
 class Server(ThreadingHTTPServer):

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ class _Stage:
             viewed.close(timeout)
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
     ``with`` block.
 
@@ -104,9 +105,6 @@ class Viewer:
         """Wait until Ctrl-C."""
         while True:  # a signal that another thread got is seen when this one wakes
             time.sleep(0.5)
-
-    def __enter__(self) -> Viewer:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -166,11 +164,12 @@ class Viewer:
             try:
                 _receive(request, path, suffix)
                 self._show([self._read(path, name)])
+                return Answer(status=HTTPStatus.NO_CONTENT)
             except PointSplatError as error:
-                return _refused(str(error).replace(str(path), name))
+                refused = str(error).replace(str(path), name)
             except (OSError, MemoryError) as error:
-                return _refused(f"the file cannot be read here ({one_line(error)})")
-        return Answer(status=HTTPStatus.NO_CONTENT)
+                refused = f"the file cannot be read here ({one_line(error)})"
+        return Answer(refused.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)
 
 
 def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
@@ -199,7 +198,3 @@ def _receive(request: Request, path: Path, suffix: str) -> None:
                 raise ValueError("the body is cut off")
             stream.write(data)
             left -= len(data)
-
-
-def _refused(text: str) -> Answer:
-    return Answer(text.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)

@@ -39,11 +39,8 @@ def captured(count: int = 9, seed: int = 0) -> ps.Views:
     return views_at(eyes, targets, torch.tensor([0.2, -0.9, 0.1]))
 
 
-def places(views: ps.Views) -> torch.Tensor:
-    return invert_rigid(views.viewmats.double())[:, :3, 3]
-
-
 def axes(views: ps.Views, column: int) -> torch.Tensor:
+    """One axis of each camera, or its position, in the world."""
     return invert_rigid(views.viewmats.double())[:, :3, column]
 
 
@@ -73,7 +70,7 @@ def test_walk_never_leans_and_passes_the_views():
     assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9, "what is right in the picture is level"
     for viewmat in views.viewmats:
         assert float((path.viewmats - viewmat).abs().amax((1, 2)).min()) < 1e-9
-    length = float(places(path).diff(dim=0).norm(dim=1).sum())
+    length = float(axes(path, 3).diff(dim=0).norm(dim=1).sum())
     assert length < 1.1 * 3 * 2.6, "along the ring and not to and fro"
     assert_rigid(path)
 
@@ -85,7 +82,7 @@ def test_film_of_an_object_goes_once_around_it(monkeypatch):
     scene = ball(20)
     path, _ = film.camera_path(scene, ViewSource(scene), FilmSettings(64, 48, fps=10, seconds=3.7))
     torch.testing.assert_close(path.viewmats[0], path.viewmats[-1], rtol=0, atol=1e-9)
-    apart = places(path)[:-1] - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+    apart = axes(path, 3)[:-1] - torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
     assert bool(((apart[:, :2].norm(dim=1) - 3).abs() < 0.15).all())
     assert float(torch.atan2(apart[:, 1], apart[:, 0]).sort().values.diff().max()) < 1.6 * 2 * math.pi / 36
     assert float(axes(path, 0)[:, 2].abs().max()) < 1e-9 and bool(((axes(path, 2)[:-1] * apart).sum(1) < 0).all())

@@ -27,24 +27,14 @@ def write_frames(frames: Iterable[np.ndarray], path: Path, fps: float, force: bo
     return video.write_frames(frames, path, check_output(path, force), fps)
 
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / np.square(a.astype(float) - b).mean()))
-
-
-def test_frames_of_a_video_are_those_drawn(tmp_path):
-    frames = drawn()
-    assert write_frames(frames, tmp_path / "film.mp4", 12) == 6
-    shown = decoded(tmp_path / "film.mp4")
-    assert len(shown) == 6
-    assert all(psnr(one, other) > 30 for one, other in zip(shown, frames, strict=True))
-    assert psnr(shown[0], frames[3]) < 20
-
-
-def test_video_plays_everywhere(tmp_path):
+def test_video_shows_the_frames_and_plays_everywhere(tmp_path):
     """H.264 with 4:2:0, its colours named, its index in front, so that it starts before all of it has come."""
     import av
 
-    write_frames(drawn(), tmp_path / "film.mp4", 29.97)
+    frames = drawn()
+    assert write_frames(frames, tmp_path / "film.mp4", 29.97) == 6
+    shown = decoded(tmp_path / "film.mp4")
+    assert all(np.square(one - other.astype(float)).mean() < 65 for one, other in zip(shown, frames, strict=True))
     with av.open(str(tmp_path / "film.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")

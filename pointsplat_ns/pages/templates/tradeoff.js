@@ -105,33 +105,29 @@ function select(key) {
   show();
 }
 
-function start() {
-  data.pictures.forEach((pictures, index) => {
-    const label = element(byId("views"), "label");
-    const input = element(label, "input", { type: "radio", name: "view", "aria-label": `View ${index + 1}` });
-    input.checked = index === state.view;
-    element(label, "img", { src: pictures[dense.key], alt: "" });
-    input.addEventListener("change", () => {
-      state.view = index;
-      showPoint();
-    });
+data.pictures.forEach((pictures, index) => {
+  const label = element(byId("views"), "label");
+  const input = element(label, "input", { type: "radio", name: "view", "aria-label": `View ${index + 1}` });
+  input.checked = index === state.view;
+  element(label, "img", { src: pictures[dense.key], alt: "" });
+  input.addEventListener("change", () => {
+    state.view = index;
+    showPoint();
   });
-  for (const input of document.querySelectorAll(".choice input"))
-    input.addEventListener("change", () => {
-      state[input.name] = input.value;
-      show();
-    });
-  for (const row of byId("points").tBodies[0].rows)
-    row.querySelector("button").addEventListener("click", () => {
-      select(row.dataset.key);
-      byId("look").scrollIntoView();
-    });
-  groups.forEach((group, index) => {
-    element(element(byId("legend"), "li", { class: `group${(index + 1) % 6}` }), "span", {}, group);
+});
+for (const input of document.querySelectorAll(".choice input"))
+  input.addEventListener("change", () => {
+    state[input.name] = input.value;
+    show();
   });
-  byId("wipe-range").addEventListener("input", (event) => byId("wipe").style.setProperty("--at", `${event.target.value}%`));
-  new ResizeObserver(showChart).observe(byId("chart").parentNode);
-  show();
-}
-
-start();
+for (const row of byId("points").tBodies[0].rows)
+  row.querySelector("button").addEventListener("click", () => {
+    select(row.dataset.key);
+    byId("look").scrollIntoView();
+  });
+groups.forEach((group, index) => {
+  element(element(byId("legend"), "li", { class: `group${(index + 1) % 6}` }), "span", {}, group);
+});
+byId("wipe-range").addEventListener("input", (event) => byId("wipe").style.setProperty("--at", `${event.target.value}%`));
+new ResizeObserver(showChart).observe(byId("chart").parentNode);
+show();
