@@ -60,7 +60,7 @@ class Server(ThreadingHTTPServer):
         if not 0 <= port < 65536:
             raise PointSplatError(f"port {port}; expected 0 to 65535")
         self.routes = routes
-        self.hosts = (*LOCAL, host) if host in LOCAL else None
+        self.hosts = LOCAL if host in LOCAL else None
         """Accepted names of the server; None for any."""
         last = min(port + 20, 65536) if port else 1  # number of ports to try
         failed = ""
