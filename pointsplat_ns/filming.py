@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pointsplat_ns.api import Source, load
-from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
-from pointsplat_ns.pages.camera_path import FPS, PHOTO_SIDE, FilmSettings, camera_path
-from pointsplat_ns.pages.film import SplitScreen, render_frames
+from pointsplat_ns.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
-from pointsplat_ns.photos.posed_scene import NO_POSES, read_found, without_poses
+from pointsplat_ns.photos.posed_scene import read_found, without_poses
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.views import Views
 
@@ -34,38 +33,36 @@ def render_path(
     output: str | Path,
     other: Source | None = None,
     *,
-    path: str | Path | None = None,
     views: Views | str | Path | None = None,
-    split: SplitScreen = "side-by-side",
     up: str | None = None,
     data: str | Path | None = None,
     width: int | None = None,
     height: int | None = None,
-    fps: float | None = None,
+    fps: float = 24.0,
     seconds: float | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> int:
-    """Film a scene, or two scenes with the same cameras, along a path.
+    """Film a scene, or two scenes side by side with the same cameras.
+
+    The film goes exactly through the views or the poses of the run's dataset; without these around an object, or past
+    what shows most of a room.
 
     Args:
         scene: N Gaussians, or the path of a scene.
         output: ``.mp4`` for a video (H.264), a folder for PNG frames, ``.png`` for the first frame alone. It appears
             when it is complete.
         other: a second scene in the same frame, to compare with. Both are labelled with their names and counts.
-        path: a camera path that nerfstudio's viewer saved (JSON). By default the film goes exactly through the views
-            or the poses of the run's dataset; without these around an object, or past what shows most of a room.
         views: views to go through, in place of the dataset's poses: views, or a file of cameras (``cameras.json`` of
             3DGS, ``transforms.json`` of nerfstudio, the folder of a COLMAP model).
-        split: layout of two scenes: "side-by-side", or "wipe" with a moving line between them.
         up: the axis that is up in the scene ("z", "-y") for a film without views; by default the scene's own, or
             estimated.
         data: folder of the run's photos and poses, or one above it, if it is no longer where the run says.
-        width: width of one scene's picture, pixels; by default that of the saved path, or of the photos, at most 960.
+        width: width of one scene's picture, pixels; by default that of the photos, at most 960.
         height: its height, pixels.
-        fps: frames a second; by default 24, or as in the saved path.
-        seconds: length; by default 10, or long enough for every pose of a dataset or a saved path. A folder gets one
-            frame for each of ``views`` by default.
+        fps: frames a second.
+        seconds: length; by default 10, or long enough for every pose of a dataset. A folder gets one frame for each of
+            ``views`` by default.
         force: overwrite existing files.
         progress: True shows a bar with the time left; a function is called with the share done.
 
@@ -74,8 +71,7 @@ def render_path(
 
     Raises:
         SceneError: if a scene is not usable, or the output cannot be written.
-        DataError: if nothing of the scene is visible, the saved path is not usable, or most views of a file see nothing
-            of the scene.
+        DataError: if nothing of the scene is visible, or most views of a file see nothing of it.
         PointSplatError: if a size, speed or length is not valid.
 
     Example:
@@ -86,25 +82,23 @@ def render_path(
         ...     ps.render_path(room, f"{folder}/walk.mp4", width=64, height=48, fps=10, seconds=0.5)
         5
     """
-    if split not in ("side-by-side", "wipe"):
-        raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
     settings = FilmSettings(width, height, fps, seconds)
     upward = up_named(up)
     kind = check_output(output, force)
     need_named_data(scene, data)
     sources = [scene] if other is None else [scene, other]
-    first, given = _with_views(scene, NO_POSES if views is None and path is not None else views)
+    first, given = _with_views(scene, views)
     if given is not None and not isinstance(views, Views):  # from a file, as large as its photos
         given = given.resized(PHOTO_SIDE)
     loaded = [first if source is scene else _loaded(source).at_offset(first.offset) for source in sources]
-    if given is not None and kind == "frames" and seconds is None and path is None:
-        settings = replace(settings, seconds=max(1, len(given)) / (fps or FPS))
+    if given is not None and kind == "frames" and seconds is None:
+        settings = replace(settings, seconds=max(1, len(given)) / fps)
     view_source = _source(None if without_poses(views) else scene, first, given, data)
-    chosen = camera_path(loaded[0], view_source, path, settings, kind == "picture", upward)
+    cameras, origin = camera_path(loaded[0], view_source, settings, kind == "picture", upward)
     names = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
-    logger.info("%d x %d pixels: %s", chosen.views.width, chosen.views.height, chosen.origin)
-    frames = render_frames(loaded, chosen.views, chosen.fps, split, names if len(loaded) > 1 else ())
-    return write_frames(tracked(frames, "rendering", len(chosen.views), progress), output, chosen.fps, force)
+    logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
+    frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
+    return write_frames(tracked(frames, "rendering", len(cameras), progress), Path(output), kind, fps)
 
 
 def open_viewer(

@@ -1,21 +1,18 @@
 """Films of scenes, as users make them."""
 
-import json
 import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from refusing import refusal, run
 
 import pointsplat_ns as ps
-from making import ball, decoded, run_of
+from making import ball, run_of
 from pointsplat_ns.cli import main
-from pointsplat_ns.geometry.transforms import viewmats_to_opengl
-from pointsplat_ns.pages.film import to_uint8
+from pointsplat_ns.pages.pictures import to_uint8
 
 SMALL = {"width": 64, "height": 48, "fps": 10}
 
@@ -56,24 +53,9 @@ def test_film_of_a_run_goes_exactly_through_its_photos(trained_walls, tmp_path, 
         assert min(np.abs(frame - shown).max() for frame in frames) <= 1
 
 
-def test_saved_path_gives_size_speed_and_cameras(scene, tmp_path):
-    views = ps.sample_views(scene, 2, 64, 48)
-    poses = torch.cat([viewmats_to_opengl(views.viewmats), torch.tensor([[[0.0, 0, 0, 1]]] * 2)], dim=1)
-    fov = float(2 * torch.rad2deg(torch.atan(24 / views.Ks[0, 1, 1])))
-    cameras = [{"camera_to_world": pose.flatten().tolist(), "fov": fov} for pose in poses]
-    saved = {"render_width": 64, "render_height": 48, "fps": 30, "camera_path": cameras}
-    (tmp_path / "path.json").write_text(json.dumps(saved))
-    assert ps.render_path(scene, tmp_path / "frames", path=tmp_path / "path.json") == 2
-    for frame, view in zip(frames_in(tmp_path / "frames"), views, strict=True):
-        assert np.abs(frame - to_uint8(ps.render(scene, view)).astype(int)).max() <= 1
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"path": "nowhere.json"}, "nowhere.json: no such file"),
-        ({"path": "spiral"}, "spiral: no such file; expected a camera path"),
-        ({"split": "diagonal"}, "expected side-by-side or wipe"),
         ({"width": 1}, "width is 1; expected 2 to 16384"),
         ({"height": 10**6}, "height is 1000000"),
         ({"fps": 0}, "fps is 0"),
@@ -89,15 +71,13 @@ def test_what_means_nothing_is_refused(options, message, scene, tmp_path):
 
 
 def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
-    options = ["--width", "64", "--height", "48", "--fps", "10", "--seconds", "0.3", "--split", "wipe"]
+    options = ["--width", "64", "--height", "48", "--fps", "10", "--seconds", "0.3"]
     scenes = [str(files / "ball.ply"), str(files / "half.splat")]
     main(["render", *scenes, "-o", str(tmp_path / "by_command"), *options])
     assert re.search(r"by_command: 3 frames, [\d.]+ kB, in ", capsys.readouterr().out)
-    ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], split="wipe", seconds=0.3, **SMALL)
+    ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], seconds=0.3, **SMALL)
     pairs = zip(frames_in(tmp_path / "by_command"), frames_in(tmp_path / "by_function"), strict=True)
-    assert all((one == other).all() and one.shape == (48, 64, 3) for one, other in pairs)
-    main(["render", *scenes, "-o", str(tmp_path / "beside.mp4"), *options[:-2]])
-    assert [frame.shape for frame in decoded(tmp_path / "beside.mp4")] == [(48, 128, 3)] * 3, "side by side"
+    assert all((one == other).all() and one.shape == (48, 128, 3) for one, other in pairs), "side by side"
 
 
 def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):

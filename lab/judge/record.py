@@ -44,13 +44,13 @@ START, END = "<!-- judge -->", "<!-- /judge -->"
 PAGE = """# What smaller scenes lose
 
 `lab/judge/record.py` writes this page from [judge.json](judge.json) and [judge_photos.json](judge_photos.json), which
-`lab/judge/judge.py` measured. [benchmarks.md](../benchmarks.md#the-judge) explains how.
+[`lab/judge/judge.py`](../benchmarks.md#the-judge) measured.
 
 - Splats are judged in at most {views} views of a camera path, captures in the poses of at most {views} held-out photos
   and at their size. Every way gets the PLY alone: no photos and no poses.
-- PSNR is in dB, against renders of the dense scene: all squared error, divided by the share of pixels that it covers.
+- PSNR is in dB, over the pixels that the dense scene covers, against its renders where nothing else is said.
 - {peer} stands for the best of its modes in each cell: {modes}.
-- Figures are means over scenes, with the worst scene in brackets.
+- Figures are means over scenes; leads have the smallest and its scene in brackets.
 """
 
 
@@ -140,10 +140,16 @@ class Figures:
         return values[method] - values[PEER if method == "prune" else "prune"]
 
 
-def summed_up(values: pd.Series, digits: int, sign: str = "", worst: str = "min") -> dict[float, str]:
-    """By budget: the mean of a figure over scenes, and in brackets the worst and its scene."""
+def means(values: pd.DataFrame, digits: int) -> dict[str, dict[float, str]]:
+    """The mean of a figure over scenes, by way and budget."""
+    found = values.groupby("keep").mean()
+    return {_way(way): {keep: f"{value:.{digits}f}" for keep, value in found[way].items()} for way in WAYS}
+
+
+def least(values: pd.Series) -> dict[float, str]:
+    """By budget: the mean of a lead over scenes, and in brackets the smallest and its scene."""
     return {
-        keep: f"{same.mean():{sign}.{digits}f} ({same.agg(worst):{sign}.{digits}f} {same.agg(f'idx{worst}')})"
+        keep: f"{same.mean():+.2f} ({same.min():+.2f} {same.idxmin()})"
         for keep, same in values.groupby("keep")
         for same in [same.droplevel("keep")]
     }
@@ -179,29 +185,27 @@ def section(figures: Figures, at: int | str) -> str:
     title = "Held-out photos" if at == PHOTOS else f"{at} pixels wide"
     parts = [f"## {title}", f"{_count(figures.scenes(at))}."]
     if at in (PHOTOS, *[other for other in figures.ats if other != PHOTOS][-1:]):
-        parts.append("PSNR against renders of the dense scene:\n\n" + _mean_table(figures, at, "covered_psnr", 2))
-        if table := _lead_table(figures, at, "covered_psnr"):
-            parts.append(f"Leads in dB against these renders:\n\n{table}")
+        parts.append("PSNR, and leads in dB:\n\n" + _lead_table(figures, at, "covered_psnr"))
     if at == PHOTOS:
         parts.append("PSNR against the photos:\n\n" + _mean_table(figures, at, "photo_psnr", 2))
     if at == LPIPS_WIDTH and (table := _mean_table(figures, at, "dense_lpips", 3)):
-        parts.append(f"LPIPS against renders of the dense scene, lower is better:\n\n{table}")
+        parts.append(f"LPIPS, lower is better:\n\n{table}")
     return "\n\n".join(parts)
 
 
 LEARNED = ("mujoco_tabletop", "pc_playbot", "pc_statue_st_peter", "lounge")
 """Scenes of the list "judged" that the network of ``compact``'s repairs was trained on (FEEDBACK.md beside it)."""
 
-SCENES = f"""No constant is chosen on [scenes of the list "judged"](../benchmarks.md#scenes). Scenes of no list are
-"other". Three rules exist because a judged scene showed the need; their constants come from scenes for tuning: repairs
-hold from nearer places (rock, taebak), merging holds before a white background (ethiopianHead), and sampled views show
-little blur (apt_kitchen_balcony). The network of `compact` was trained on {", ".join(LEARNED)}.
+SCENES = f"""No constant is chosen on [judged scenes](../benchmarks.md#scenes). They showed the need of three
+rules, whose constants come from scenes for tuning: repairs hold from nearer places (rock, taebak), merging before a
+white background (ethiopianHead), and sampled views show little blur (apt_kitchen_balcony).
+The network of `compact` was trained on {", ".join(LEARNED)}.
 Rows of captures and of taebak are older: of other sampled views, and of repairs of 48 steps."""
 
-UNLEARNED = f"""The gain of `compact` over `prune` in dB without {", ".join(LEARNED)}, in brackets with them."""
+UNLEARNED = "The gain of `compact` over `prune` in dB without the scenes of its training, in brackets with them."
 
-TIME = """CPU seconds and peak memory of one process, with starting, reading and writing: mean (largest) over scenes.
-splat-transform stands for the mode of the best PSNR."""
+TIME = """CPU seconds and peak memory of one process, mean (largest) over scenes. splat-transform stands for the mode of
+the best PSNR."""
 
 
 def _scene_lines(rows: list[Row], figures: Figures) -> str:
@@ -226,13 +230,13 @@ def _by_budget(figures: Figures, head: str, columns: dict[str, dict[float, str]]
 
 
 def _mean_table(figures: Figures, at: int | str, column: str, digits: int) -> str:
-    values, worst = figures.of(at, column), "max" if column.endswith("lpips") else "min"
-    return _by_budget(figures, "kept", {_way(way): summed_up(values[way], digits, "", worst) for way in WAYS})
+    return _by_budget(figures, "kept", means(figures.of(at, column), digits))
 
 
 def _lead_table(figures: Figures, at: int | str, column: str) -> str:
-    ours, repaired = (summed_up(figures.lead(method, at, column), 2, "+") for method in OURS)
-    return _by_budget(figures, "kept", {f"`prune` over {PEER}": ours, "`compact` over `prune`": repaired})
+    ours, repaired = (least(figures.lead(method, at, column)) for method in OURS)
+    leads = {f"`prune` over {PEER}": ours, "`compact` over `prune`": repaired}
+    return _by_budget(figures, "kept", means(figures.of(at, column), 2) | leads)
 
 
 def _unlearned_table(rows: list[Row], figures: Figures) -> str:

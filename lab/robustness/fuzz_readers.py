@@ -288,7 +288,6 @@ READERS |= {
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),
-    "camera-path": at("a.json", "pointsplat_ns.pages.camera_path:read_path"),
     "camera-json": at("a.json", "pointsplat_ns.io.camera_files:read_views", _transforms),
     "colmap-cameras": at("cameras.bin", _poses_in_folder, _colmap("bin")),
     "colmap-images": at("images.bin", _poses_in_folder, _colmap("bin")),

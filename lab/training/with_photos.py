@@ -39,8 +39,8 @@ from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.rasterizer import render
 
-DENSE, CAP_SHORT, CAP_LONG = "dense", "cap, short", "cap, long"
-"""Names of the dense scene, and of rows that the record has of a method that is gone."""
+DENSE = "dense"
+"""Name of the dense scene."""
 
 COMPACTED, COMPACTED_LONG = "compact --photos", "compact --photos, long"
 """The way that says how many seconds the others get; and the same with as many seconds as the dense training took."""
@@ -55,28 +55,26 @@ WAYS: dict[str, list[str]] = {
 SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, trained on"}
 """Scores of prune that training on photos follows, and the names of these ways."""
 
-METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values(), CAP_SHORT, CAP_LONG)
+METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values())
 """All ways, in the order of the tables."""
 
 PAGE = f"""# With the photos at hand
 
-`lab/training/with_photos.py` writes this page from [with_photos.json](with_photos.json), which it measured. Constants
-of `{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
+`lab/training/with_photos.py` measured [with_photos.json](with_photos.json) and writes this page from it. Constants of
+`{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
 
-- PSNR and LPIPS are means over all held-out photos.
-- "s" are CPU seconds of a process on one thread. All ways but the cap need the dense training as well. The machine was
-  busy: equal work differs by up to a half.
-- `{COMPACTED}` merges, repairs and trains on the training photos for 1,200 steps. "{COMPACTED_LONG}" takes
-  `--seconds` of the CPU seconds of the dense training: about half as many CPU seconds.
+- Figures of a scene are CPU seconds, PSNR and LPIPS, in this order; "-" was not measured.
+- CPU seconds are of a process on one thread of a busy machine: equal work differs by up to a half. All ways need the
+  dense training as well.
+- PSNR (dB) and LPIPS are means over all held-out photos.
+- `{COMPACTED}` trains for 1,200 steps. "{COMPACTED_LONG}" takes `--seconds` of the CPU seconds of the dense
+  training: about half as many CPU seconds.
 - "{SCORES["lightgaussian"]}" trains the Gaussians with the highest scores as `{COMPACTED}` does, for as many CPU
   seconds. The method's own schedule is longer.
-- "cap" is a training with a limit of Gaussians, by 3DGS-MCMC's densification, that the package had. "{CAP_SHORT}" took
-  about the CPU seconds of `{COMPACTED}`; "{CAP_LONG}" those of `{COMPACTED}` and of the dense training.
-- "-" was not measured.
 """
 
-COLUMNS = {"cpu_seconds": ("s", ",.0f"), "psnr": ("PSNR", ".2f"), "lpips": ("LPIPS", ".3f")}
-"""Figures of a way at one budget, with their heads and formats."""
+FIGURES = {"cpu_seconds": ",.0f", "psnr": ".2f", "lpips": ".3f"}
+"""Figures of a way at one budget, with their formats."""
 
 
 _POINTSPLAT = (sys.executable, "-c", "from pointsplat_ns.cli import program; program()")
@@ -172,10 +170,9 @@ def page(rows: list[Row]) -> str:
         parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest to largest):\n\n{leads}")
     for scene, same in sorted(grouped(rows, lambda row: row["scene"]).items()):
         dense = next(row for row in same if row["method"] == DENSE)
-        figures = ", ".join(f"{head} {cell}" for (head, _), cell in zip(COLUMNS.values(), _cells(dense), strict=True))
-        about = f"{dense['count']:,} Gaussians, {dense['steps']:,} steps, {figures}"
-        photos = f"{dense['photos']} held-out photos of {dense['width']} x {dense['height']}"
-        parts.append(f"## {scene}\n\nDense: {about}. {photos}.\n\n{scene_table(same)}")
+        about = f"Dense: {dense['count']:,} Gaussians of {dense['steps']:,} steps, {_cell(dense)}"
+        photos = f"{dense['photos']} photos of {dense['width']} x {dense['height']}"
+        parts.append(f"## {scene}\n\n{about}. {photos}.\n\n{scene_table(same)}")
     return "\n\n".join(parts) + "\n"
 
 
@@ -184,14 +181,13 @@ def scene_table(rows: list[Row]) -> str:
     found = {(row["method"], row["keep"]): row for row in rows if row["method"] != DENSE}
     keeps = sorted({keep for _, keep in found}, reverse=True)
     ways = sorted({method for method, _ in found}, key=METHODS.index)
-    heads = [f"{percent(keep)}: {head}" for keep in keeps for head, _ in COLUMNS.values()]
-    lines = [[way, *(cell for keep in keeps for cell in _cells(found.get((way, keep), {})))] for way in ways]
-    return markdown(["way", *heads], lines)
+    lines = [[way, *(_cell(found.get((way, keep), {})) for keep in keeps)] for way in ways]
+    return markdown(["way", *map(percent, keeps)], lines)
 
 
-def _cells(row: Row) -> list[str]:
-    """The figures of a row in the order of :data:`COLUMNS`, "-" for those that it lacks."""
-    return [format(row[name], form) if name in row else "-" for name, (_, form) in COLUMNS.items()]
+def _cell(row: Row) -> str:
+    """The figures of a row that it has, "-" for none."""
+    return ", ".join(format(row[name], form) for name, form in FIGURES.items() if name in row) or "-"
 
 
 def lead_table(rows: list[Row]) -> str:

@@ -32,7 +32,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "render": (
         ("a film", "pointsplat render room.ply -o room.mp4"),
-        ("two scenes with a wipe", "pointsplat render room.ply room_pruned.ply --split wipe -o both.mp4"),
+        ("two scenes side by side", "pointsplat render room.ply room_pruned.ply -o both.mp4"),
     ),
     "export": (("the scene of a run", "pointsplat export outputs/room/splatfacto-cpu/RUN -o room.ply"),),
     "demo": (("a scene to try commands with: room.ply", "pointsplat demo"),),

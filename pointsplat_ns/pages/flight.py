@@ -30,7 +30,7 @@ from pointsplat_ns.views import Views
 logger = logging.getLogger("pointsplat_ns")
 
 FLIGHT_SCRIPTS = ("spz.js", "splats.js", "camera.js", "flight.js")
-"""Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page` with ``with_workers``."""
+"""Scripts of a flight, for :func:`~pointsplat_ns.pages.html.page`; they start workers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +78,13 @@ class FlightFrame:
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
         """Data for ``flight.js``, from results of :meth:`packed` for one or two scenes; the first is on the left."""
         fov = 2 * torch.atan(0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs())
+        eyes = -(self.views.viewmats[:, :3, :3].mT @ self.views.viewmats[:, :3, 3:])[..., 0]
         return {
             "scenes": list(packed),
             "views": [
                 {"eye": eye, "fov": angle, **dict(zip(("right", "down", "ahead"), viewmat[:3], strict=False))}
                 for eye, angle, viewmat in zip(
-                    eyes_of(self.views).tolist(), fov.tolist(), self.views.viewmats[:, :3, :3].tolist(), strict=True
+                    eyes.tolist(), fov.tolist(), self.views.viewmats[:, :3, :3].tolist(), strict=True
                 )
             ],
             "aspect": self.views.width / self.views.height,
@@ -94,11 +95,6 @@ class FlightFrame:
             "antialiased": self.views.rasterize_mode == "antialiased",
             "drag": "orbit" if self.whole else "look",
         }
-
-
-def eyes_of(views: Views) -> Tensor:
-    """Positions (C, 3) of cameras."""
-    return -(views.viewmats[:, :3, :3].mT @ views.viewmats[:, :3, 3:])[..., 0]
 
 
 def _up_of(views: Views, estimated: Up) -> Up:

@@ -12,15 +12,13 @@ from urllib.parse import quote
 import numpy as np
 import torch
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, replacing
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.looking.content import in_units
-from pointsplat_ns.pages.film import with_labels
 from pointsplat_ns.pages.flight import FlightFrame
 from pointsplat_ns.pages.html import page
-from pointsplat_ns.pages.pictures import picture_uri, read_png
+from pointsplat_ns.pages.pictures import picture_uri, read_png, with_labels
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
@@ -59,12 +57,12 @@ def write_gallery(path: Path, title: str, results: Sequence[SceneResult]) -> Non
     scenes = [_facts(result, path) for result in results]
     done = [result for result in results if result.megabytes is not None]
     sizes = [sum(result.megabytes_before or 0.0 for result in done), sum(result.megabytes or 0.0 for result in done)]
-    text = page(
+    html = page(
         "gallery.html", title=title, scenes=scenes, done=len(done), width=2 * WIDTH, height=HEIGHT,
         sizes=[bytes_text(1e6 * size) for size in sizes],
     )  # fmt: skip
     with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(html)
 
 
 def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
@@ -82,27 +80,20 @@ def write_sheet(path: Path, results: Sequence[SceneResult]) -> None:
         before, after = _sizes(result)
         row, column = divmod(index, columns)
         small = pair[: height * step : step, ::step][:, :width]
-        labelled = with_labels(small, (f"{result.name}: {before}", after), width // 2)
+        labelled = with_labels(small, (f"{result.name}: {before}", after))
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = labelled
     write_picture(torch.from_numpy(sheet) / 255, path)
 
 
 def _pair(result: SceneResult) -> np.ndarray | None:
     """The pair of pictures (H, 2 W, 3) uint8 of a result; None if it is missing or damaged."""
-    try:
-        return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
-    except DataError:
-        return None
+    return None if result.megabytes is None else read_png(pair_of(Path(result.output)), 2 * WIDTH, HEIGHT)
 
 
 def _sizes(result: SceneResult) -> tuple[str, str]:
-    """Count and size before and after."""
-    before, after = (
-        ", ".join(
-            ([] if count is None else [f"{count:,} Gaussians"]) + ([] if size is None else [bytes_text(1e6 * size)])
-        )
-        for count, size in ((result.before, result.megabytes_before), (result.after, result.megabytes))
-    )
+    """Count and size before and after; a record that somebody changed may lack them."""
+    known = (result.before, result.megabytes_before), (result.after, result.megabytes)
+    before, after = (f"{count or 0:,} Gaussians, {bytes_text(1e6 * (size or 0.0))}" for count, size in known)
     return before, after
 
 

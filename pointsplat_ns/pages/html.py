@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -29,18 +30,15 @@ def _environment() -> Environment:
     return environment
 
 
-def page(
-    template: str, scripts: tuple[str, ...] = (), *, with_workers: bool = False, connects: bool = False, **values: Any
-) -> str:
-    """One HTML page with its style, scripts and data in it, from a template that extends ``base.html``.
+def page(template: str, scripts: Sequence[str] = (), allowed: Sequence[str] = (), **values: Any) -> bytes:
+    """One HTML page, as UTF-8, with its style, scripts and data in it, from a template that extends ``base.html``.
 
     Its content security policy allows the script and style with the page's hashes and embedded pictures, and no other
     resource. So a text without escaping could run no code.
 
     Args:
         scripts: names of the scripts, in their order in the page.
-        with_workers: allow workers, whose programs are parts of the scripts.
-        connects: allow requests to the server that the page comes from.
+        allowed: further rules of the policy, such as ``worker-src blob:`` for workers.
         values: variables of the template. Texts are escaped; undecodable bytes of file names become "?".
 
     Raises:
@@ -55,19 +53,13 @@ def page(
         "img-src data:",
         f"style-src '{_hash(style)}'",
         f"script-src '{_hash(script)}'" if script else "script-src 'none'",
-        *(("worker-src blob:",) if with_workers else ()),
-        *(("connect-src 'self'",) if connects else ()),
+        *allowed,
         "base-uri 'none'",
         "form-action 'none'",
     )
-    fixed = {
-        "style": _unescaped(style),
-        "script": _unescaped(script),
-        "policy": "; ".join(rules),
-        "version": __version__,
-    }
-    text = _environment().get_template(template).render(**fixed, **values)
-    return text.encode("utf-8", "replace").decode("utf-8")
+    fixed = {"style": _unescaped(style), "script": _unescaped(script), "version": __version__}
+    text = _environment().get_template(template).render(**fixed, policy="; ".join(rules), **values)
+    return text.encode("utf-8", "replace")
 
 
 def _source(name: str) -> str:

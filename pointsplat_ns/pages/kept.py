@@ -25,10 +25,8 @@ class Level:
     """A scene at a share of its Gaussians."""
 
     scene: Gaussians
-    how: str
-    """Text on the way it was made, which follows the count."""
-    spz: bytes = b""
-    """The scene for pages, once one has asked for it."""
+    how: str  # text on the way it was made, which follows the count
+    spz: bytes = b""  # the scene for pages, once one has asked for it
 
 
 class MergingStopped(Exception):
@@ -90,7 +88,8 @@ class ViewedScene:
                     raise MergingStopped
 
             try:
-                level = Level(self._merger.merged(self._count(percent), report).scene, "merged")
+                count = resolve_keep(len(self.scene), percent / 100)
+                level = Level(self._merger.merged(count, report).scene, "merged")
             except MergingStopped:
                 return None
             except (PointSplatError, MemoryError, RuntimeError) as error:
@@ -116,11 +115,8 @@ class ViewedScene:
         self.stop()
         self._merging.acquire(timeout=timeout)
 
-    def _count(self, percent: int) -> int:
-        return resolve_keep(len(self.scene), percent / 100)
-
     def _by_coverage(self, percent: int) -> Gaussians:
-        return self.scene[select(self._scores, self._count(percent))]
+        return self.scene[select(self._scores, resolve_keep(len(self.scene), percent / 100))]
 
     @cached_property
     def _scores(self) -> Tensor:

@@ -1,33 +1,59 @@
-"""Pictures in pages, and pictures from PNG files."""
+"""Pictures of pages and films: as bytes, with labels, as texts, and from PNG files."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import one_line
+
+def to_uint8(picture: Tensor) -> np.ndarray:
+    """A picture (H, W, 3) in [0, 1] as uint8."""
+    return (255 * picture.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
 
 
-def read_png(path: Path, width: int, height: int) -> np.ndarray:
-    """The pixels of a PNG file, (height, width, 3) uint8. The size is checked before the pixels are read. Raises
-    DataError if the file is missing, not a PNG, damaged, or of another size."""
-    from PIL import Image, UnidentifiedImageError
+def with_labels(pixels: np.ndarray, labels: Sequence[str]) -> np.ndarray:
+    """A picture (H, W, 3) uint8 of two halves with their labels on dark ground, at the top left and the top right,
+    shortened to a half."""
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
 
-    expected = f"expected a PNG picture of {width} x {height} pixels"
+    height, width = pixels.shape[:2]
+    size = max(round(0.03 * height), 11)  # pixels
+    image = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(image, "RGBA")
+    # This font has the letters of most languages; Pillow's has Latin ones only.
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+    pad = size // 2
+    for index, label in enumerate(labels):
+        text = whole = " ".join(label.split())
+        while text and font.getlength(text) > width // 2 - 4 * pad:
+            whole = whole[:-1]
+            text = whole and whole + "..."
+        if not text:
+            continue
+        long = int(font.getlength(text))
+        left = pad if index == 0 else width - long - 3 * pad
+        draw.rectangle((left, pad, left + long + 2 * pad, 2 * pad + size + pad // 2), fill=(0, 0, 0, 150))
+        draw.text((left + pad, pad + pad // 2), text, font=font, fill=(255, 255, 255, 255))
+    return np.asarray(image)
+
+
+def read_png(path: Path, width: int, height: int) -> np.ndarray | None:
+    """The pixels of a PNG file, (height, width, 3) uint8; None if it is missing, not a PNG, damaged, or of another
+    size, which is checked before the pixels are read."""
+    from PIL import Image
+
     try:
         with Image.open(path, formats=["PNG"]) as picture:
-            if picture.size != (width, height):
-                raise DataError(f"{path}: has {picture.width} x {picture.height} pixels; {expected}")
-            return np.asarray(picture.convert("RGB"))
-    except UnidentifiedImageError as error:
-        raise DataError(f"{path}: not a PNG picture; {expected}") from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        found = error.strerror if isinstance(error, OSError) and error.strerror else one_line(error)
-        raise DataError(f"{path}: cannot be read ({found}); {expected}") from error
+            return np.asarray(picture.convert("RGB")) if picture.size == (width, height) else None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
 
 
 def picture_uri(pixels: np.ndarray) -> str:

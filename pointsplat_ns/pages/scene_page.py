@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
@@ -90,8 +89,14 @@ def write_page(
 
         included = [packed(name, scene) for name, scene in zip(names, scenes, strict=True)]
         missing = ""
-        while len(text := _html(frame.data(included), title, notes, missing)) > 1e6 * limit_mb:
-            excess = f"the page would have {len(text) / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
+        while True:
+            html = page(
+                "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), ("worker-src blob:",), title=title, notes=notes,
+                missing=missing, flight=frame.data(included), live=False, drops=(),
+            )  # fmt: skip
+            if len(html) <= 1e6 * limit_mb:
+                break
+            excess = f"the page would have {len(html) / 1e6:.1f} MB, more than the {limit_mb:g} MB allowed"
             if len(included) == 1:
                 raise PointSplatError(f"{path}: {excess}; expected a larger limit, or fewer Gaussians")
             largest = max(included, key=lambda scene: len(scene["spz"]))
@@ -99,13 +104,5 @@ def write_page(
             missing = f"{largest['name']} is left out: with it {excess}"
             logger.warning("%s: %s", path, missing)
     with replacing(path) as part:
-        part.write_bytes(text)
+        part.write_bytes(html)
     return path
-
-
-def _html(flight: dict[str, Any], title: str, notes: Sequence[str], missing: str) -> bytes:
-    text = page(
-        "scene.html", (*FLIGHT_SCRIPTS, "scene.js"), with_workers=True, title=title, notes=notes, missing=missing,
-        flight=flight, data={"flight": flight}, live=False, drops=(),
-    )  # fmt: skip
-    return text.encode("utf-8")

@@ -25,12 +25,9 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 class Request:
     """A request to a route."""
 
-    options: Mapping[str, str]
-    """What follows "?" in its address."""
-    length: int
-    """Size of its body, bytes."""
-    body: BinaryIO
-    """What the client sends; empty reads if it sends less than it said."""
+    options: Mapping[str, str]  # what follows "?" in its address
+    length: int  # of its body, bytes
+    body: BinaryIO  # reads are empty if the client sends less than it said
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,7 @@ class Route:
     """A path of the server."""
 
     answer: Callable[[Request], Answer]
-    largest: int = 0
-    """Largest body, bytes; 0 for requests without one, which get pages."""
+    largest: int = 0  # body, bytes; 0 for requests without one, which get pages
 
 
 class Server(ThreadingHTTPServer):
@@ -64,7 +60,7 @@ class Server(ThreadingHTTPServer):
         if not 0 <= port < 65536:
             raise PointSplatError(f"port {port}; expected 0 to 65535")
         self.routes = routes
-        self.hosts = (*LOCAL, host) if host in LOCAL else None
+        self.hosts = LOCAL if host in LOCAL else None
         """Accepted names of the server; None for any."""
         last = min(port + 20, 65536) if port else 1  # number of ports to try
         failed = ""
@@ -84,11 +80,6 @@ class Server(ThreadingHTTPServer):
         self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.server_port}"
         """Address of the page."""
         threading.Thread(target=self.serve_forever, name="serving", daemon=True).start()
-
-    def close(self) -> None:
-        """Stop to listen."""
-        self.shutdown()
-        self.server_close()
 
     def server_bind(self) -> None:
         """Bind without a look-up of the machine's name, which may take seconds."""
@@ -117,16 +108,10 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 30  # s without a byte from a client
     server_version, sys_version = "pointsplat", ""
 
-    def do_GET(self) -> None:
-        self._serve()
-
-    def do_POST(self) -> None:
-        self._serve()
-
     def log_message(self, *_: object) -> None:
         """Requests are not logged."""
 
-    def _serve(self) -> None:
+    def do_GET(self) -> None:
         answer = self._answer()
         self.send_response(answer.status)
         headers = {
@@ -144,6 +129,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         for start in range(0, len(answer.body), 1 << 20):  # the time limit holds for each piece
             self.wfile.write(answer.body[start : start + (1 << 20)])
+
+    do_POST = do_GET
 
     def _answer(self) -> Answer:
         server = cast(Server, self.server)
@@ -168,11 +155,6 @@ class _Handler(BaseHTTPRequestHandler):
             return Answer(text.encode(), status=http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         try:
             return route.answer(Request(options, int(length), cast(BinaryIO, self.rfile)))
-        except (
-            ValueError,
-            TypeError,
-            KeyError,
-            OverflowError,
-            RecursionError,
-        ):  # a body that no page of this server sends
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+            # A body that no page of this server sends.
             return Answer(status=http.HTTPStatus.BAD_REQUEST)

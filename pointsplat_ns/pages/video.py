@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from PIL import Image
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.outputs import need_folder, need_writable
 
 Kind = Literal["video", "frames", "picture"]
 
@@ -22,55 +24,40 @@ ENCODER = "libx264"
 _FRAME = re.compile(r"frame_\d{5,}\.png")
 
 
-def kind_of(output: Path | str) -> Kind:
-    """Kind of output of a path: a video (.mp4), one picture (.png), or a folder of pictures (no suffix). Raises
-    SceneError if the path has another suffix."""
+def check_output(output: Path | str, force: bool) -> Kind:
+    """The kind of an output, checked before the long work: a video (.mp4), one picture (.png), or a folder of frames
+    (no suffix). Raises SceneError if the path has another suffix, cannot be written, or must not be overwritten."""
     path = Path(output)
-    kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture", "": "frames"}
-    kind = "frames" if path.is_dir() else kinds.get(path.suffix.lower())
+    if path.is_dir() or not path.suffix:
+        need_folder(path)
+        found = sorted(item.name for item in path.iterdir()) if path.exists() else []
+        if others := [name for name in found if not _FRAME.fullmatch(name)]:
+            raise SceneError(f"{path}: holds {others[0]}; expected a new folder, or one of frames")
+        if found and not force:
+            raise SceneError(f"{path}: holds frames already; name another folder, or overwrite them with --force")
+        return "frames"
+    kinds: dict[str, Kind] = {".mp4": "video", ".png": "picture"}
+    kind = kinds.get(path.suffix.lower())
     if kind is None:
         raise SceneError(
             f"{path}: cannot write a {path.suffix} file; expected a video (.mp4), a picture (.png) or a folder, whose "
             "name has no dot"
         )
+    need_writable(path, force)
     return kind
 
 
-def check_output(output: Path | str, force: bool) -> Kind:
-    """Kind of output of a path, checked before the long work. Raises SceneError as :func:`kind_of`, or if a file must
-    not be overwritten."""
-    path, kind = Path(output), kind_of(output)
-    if kind == "frames" and path.exists():
-        found = sorted(item.name for item in path.iterdir()) if path.is_dir() else [path.name]
-        others = [name for name in found if not _FRAME.fullmatch(name)]
-        if others or not path.is_dir():
-            raise SceneError(f"{path}: holds {(others or found)[0]}; expected a new folder, or one of frames")
-        if found and not force:
-            raise SceneError(f"{path}: holds frames already; name another folder, or overwrite them with --force")
-    elif path.exists() and not force:
-        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
-    return kind
-
-
-def write_frames(frames: Iterable[np.ndarray], output: Path | str, fps: float, force: bool = False) -> int:
-    """Write all frames, (H, W, 3) uint8 each, or none, to a file that ends in .mp4 or .png, or to a folder; returns
-    their number. Those of a video have one size, of even width and height; a picture is one frame. Raises SceneError if
-    it cannot be written."""
-    path, kind = Path(output), check_output(output, force)
+def write_frames(frames: Iterable[np.ndarray], path: Path, kind: Kind, fps: float) -> int:
+    """Write all frames, (H, W, 3) uint8 each, or none, over what is there; returns their number. Those of a video have
+    one size, of even width and height; a picture is one frame. Raises SceneError if it cannot be written."""
     if kind == "video":
         return _write_video(frames, path, fps)
-    if kind == "picture":
-        [pixels] = frames
-        with replacing(path) as part:
-            _write_png(pixels, part)
-        return 1
-    return _write_folder(frames, path)
-
-
-def _write_png(pixels: np.ndarray, path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, format="PNG")
+    if kind == "frames":
+        return _write_folder(frames, path)
+    [pixels] = frames
+    with replacing(path) as part:
+        Image.fromarray(pixels).save(part, format="PNG")
+    return 1
 
 
 def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
@@ -81,7 +68,7 @@ def _write_folder(frames: Iterable[np.ndarray], folder: Path) -> int:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=beside) as part:
             count = 0
             for pixels in frames:
-                _write_png(pixels, Path(part) / f"frame_{count:05d}.png")
+                Image.fromarray(pixels).save(Path(part) / f"frame_{count:05d}.png")
                 count += 1
             folder.mkdir(exist_ok=True)
             for old in folder.iterdir():
@@ -104,16 +91,15 @@ def _write_video(frames: Iterable[np.ndarray], path: Path, fps: float) -> int:
         try:
             with av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 rate = Fraction(fps).limit_denominator(1001)
-                stream = container.add_stream(ENCODER, rate=rate, options={"crf": str(18)})
+                stream = container.add_stream(ENCODER, rate=rate, options={"crf": "18"})
                 for pixels in frames:
                     if count == 0:
                         stream.height, stream.width = pixels.shape[:2]
                         stream.pix_fmt = "yuv420p"
                         stream.gop_size = max(round(fps), 1)  # for quick seeking
                         context = stream.codec_context
-                        context.colorspace = context.color_primaries = context.color_trc = (
-                            1  # BT.709, written to the file
-                        )
+                        bt709 = 1  # written to the file
+                        context.colorspace = context.color_primaries = context.color_trc = bt709
                         context.color_range = ColorRange.MPEG
                     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
                     frame = frame.reformat(

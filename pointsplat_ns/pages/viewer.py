@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ class _Stage:
             viewed.close(timeout)
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """Shows one or two scenes, both in the same frame, in the browser, until it is closed; also the context of a
     ``with`` block.
 
@@ -105,9 +106,6 @@ class Viewer:
         while True:  # a signal that another thread got is seen when this one wakes
             time.sleep(0.5)
 
-    def __enter__(self) -> Viewer:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
@@ -115,7 +113,8 @@ class Viewer:
         """End the server and all drawing. A second call does nothing."""
         if self._server.fileno() < 0:
             return
-        self._server.close()
+        self._server.shutdown()
+        self._server.server_close()
         # Threads that are in torch when the program ends abort it: they are waited for, and these locks are kept.
         for lock in (self._working, self._dropping):
             lock.acquire(timeout=5.0)  # s
@@ -138,7 +137,8 @@ class Viewer:
         wanted, stage = json.loads(request.body.read(request.length)), self._stage
         if stage is None or wanted["stage"] != stage.number:
             return Answer(status=HTTPStatus.CONFLICT)
-        index, percent, have = int(wanted["scene"]), _percent(wanted["percent"]), str(wanted["have"])
+        index, percent, have = int(wanted["scene"]), round(wanted["percent"]), str(wanted["have"])
+        percent = min(max(percent, 1), 100)
         viewed = dict(enumerate(stage.scenes))[index]
         if not have:
             viewed.stop()
@@ -164,21 +164,21 @@ class Viewer:
             try:
                 _receive(request, path, suffix)
                 self._show([self._read(path, name)])
+                return Answer(status=HTTPStatus.NO_CONTENT)
             except PointSplatError as error:
-                return _refused(str(error).replace(str(path), name))
+                refused = str(error).replace(str(path), name)
             except (OSError, MemoryError) as error:
-                return _refused(f"the file cannot be read here ({one_line(error)})")
-        return Answer(status=HTTPStatus.NO_CONTENT)
+                refused = f"the file cannot be read here ({one_line(error)})"
+        return Answer(refused.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)
 
 
 def _live_page(title: str, flight: dict[str, Any] | None, drops: bool) -> bytes:
     """The page, with scenes that it asks this server for; without a flight it only takes a file."""
     scripts = (*((*FLIGHT_SCRIPTS, "live.js", "scene.js") if flight else ()), *(("drop.js",) if drops else ()))
-    text = page(
-        "scene.html", scripts, with_workers=True, connects=True, title=title, flight=flight, live=True,
-        drops=READABLE_NAMES if drops else (), notes=(), missing="", data={"flight": flight},
+    return page(
+        "scene.html", scripts, ("worker-src blob:", "connect-src 'self'"), title=title, flight=flight, live=True,
+        drops=READABLE_NAMES if drops else (), notes=(), missing="",
     )  # fmt: skip
-    return text.encode("utf-8")
 
 
 def _receive(request: Request, path: Path, suffix: str) -> None:
@@ -198,12 +198,3 @@ def _receive(request: Request, path: Path, suffix: str) -> None:
                 raise ValueError("the body is cut off")
             stream.write(data)
             left -= len(data)
-
-
-def _percent(value: Any) -> int:
-    """A share of the Gaussians, 1 to 100 percent."""
-    return min(max(round(value), 1), 100)
-
-
-def _refused(text: str) -> Answer:
-    return Answer(text.encode("utf-8", "replace"), status=HTTPStatus.UNPROCESSABLE_ENTITY)

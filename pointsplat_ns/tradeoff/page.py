@@ -28,12 +28,12 @@ def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path
     dense, best = found.points[0], found.point(found.recommended)
     shown = next_best(found.points) or best if best is dense else best
     data = {"points": [_data(point) for point in found.points], "pictures": list(pictures), "shown": shown.key}
-    text = page(
-        "tradeoff.html", ("chart.js", "tradeoff.js"), found=found, photos=dense.against_photos is not None,
+    html = page(
+        "tradeoff.html", ("tradeoff.js",), found=found, photos=dense.against_photos is not None,
         shown=shown, word_for=word_for, three_digits=three_digits, infinity=math.inf, data=data,
     )  # fmt: skip
     with replacing(output) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(html)
 
 
 def _data(point: Point) -> dict[str, Any]:

@@ -18,8 +18,7 @@ from pointsplat_ns.io.outputs import need_folder
 from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
-from pointsplat_ns.pages.film import to_uint8
-from pointsplat_ns.pages.pictures import picture_uri
+from pointsplat_ns.pages.pictures import picture_uri, to_uint8
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, progress_bar

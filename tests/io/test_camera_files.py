@@ -173,7 +173,7 @@ def inria_with(**changes) -> list:
     ("content", "message"),
     [
         ("[" * 100_000, "cannot be read as JSON"),
-        ({"camera_path": []}, "a camera path of nerfstudio's viewer, for `render --path`"),
+        ({"camera_path": []}, "a path for `ns-render camera-path`; expected"),
         ([], "0 cameras; expected 1 to 100000"),
         (inria_with(position=[10**400, 0, 0]), r"the pose of camera 1 (.*)?is no rigid motion"),
         (inria_with(position=[1e10, 0, 0]), r"camera 1 \(frame_0.png\) is too far away"),

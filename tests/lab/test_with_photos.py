@@ -8,14 +8,14 @@ import pytest
 from lab.judge.record import FOLDER, read
 from lab.training import with_photos as program
 from lab.training.score_and_train import CpuBudget
-from lab.training.with_photos import CAP_LONG, CAP_SHORT, COMPACTED, DENSE, METHODS, SCORES
+from lab.training.with_photos import COMPACTED, DENSE, METHODS, SCORES
 
 
 def row(keep: float, method: str, psnr: float = 25.0, seconds: float = 60.0, scene: str = "fox"):
     return {
         **{"scene": scene, "at": "photos", "keep": keep, "method": method, "count": round(1000 * keep), "photos": 5},
         **{"width": 360, "height": 640, "steps": 2000, "cpu_seconds": seconds, "psnr": psnr, "ssim": 0.9},
-        "needs_dense": method not in (DENSE, CAP_SHORT, CAP_LONG),
+        "needs_dense": method != DENSE,
     }
 
 
@@ -41,7 +41,7 @@ class Tried(program.Capture):
 def test_all_ways_are_measured_and_scores_train_as_long_as_compact(tmp_path):
     capture = Tried(tmp_path)
     rows = list(program.measured(capture, (0.1,), []))
-    assert [found["method"] for found in rows] == list(METHODS[:-2]) and rows[0]["cpu_seconds"] == 1010
+    assert [found["method"] for found in rows] == list(METHODS) and rows[0]["cpu_seconds"] == 1010
     assert ("compact", "--photos", 100) in capture.asked
     assert ("compact", "--photos", "--seconds", "1010", 100) in capture.asked
     assert ("lightgaussian", "60.0", 100) in capture.asked and ("pup", "60.0", 100) in capture.asked
@@ -58,7 +58,6 @@ ROWS = [
     *(row(1.0, DENSE, 30.0, 700.0, scene) for scene in ("fox", "vr_project")),
     *(row(0.1, COMPACTED, psnr, 60.0, scene) for scene, psnr in (("fox", 28.0), ("vr_project", 27.0))),
     row(0.1, SCORES["pup"], 26.5),
-    row(0.1, CAP_LONG, 26.0, 755.0, "vr_project"),
 ]
 
 

@@ -49,15 +49,8 @@ def test_a_share_is_there_at_once_by_coverage_and_then_merged(levels, scene):
     assert same(levels.at(100).scene, scene) and levels.merged(100) is levels.whole
 
 
-def test_merging_is_stopped_by_the_choice_of_another_share(levels, monkeypatch):
-    begun, found = threading.Event(), []
-
-    def endless(merger, count, progress):
-        begun.set()
-        while True:
-            progress(0.5)
-
-    monkeypatch.setattr(module.Merger, "merged", endless)
+def test_merging_is_stopped_by_the_choice_of_another_share(levels, endless, monkeypatch):
+    (begun, _), found = endless, []
     page = threading.Thread(target=lambda: found.append(levels.merged(30)))
     page.start()
     assert begun.wait(30)

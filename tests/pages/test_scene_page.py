@@ -14,7 +14,6 @@ from PIL import Image
 import pointsplat_ns as ps
 from html_parts import hashed, names_nothing_outside, parts_of, policy_of
 from making import ball, in_pictures, views_from_within
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import read_spz
 from pointsplat_ns.looking.content import in_units, thinned
@@ -50,22 +49,13 @@ def test_page_names_nothing_outside_of_itself_and_lets_only_its_own_scripts_run(
     }
 
 
-@pytest.mark.parametrize("others", [("live.js", "drop.js", "scene.js"), ("chart.js", "tradeoff.js")])
-def test_scripts_of_one_page_declare_each_name_once(others):
+def test_scripts_of_one_page_declare_each_name_once():
     """Else the browser runs none of them."""
     folder = Path(html.__file__).with_name("templates")
-    text = "\n".join((folder / name).read_text("utf-8") for name in (*FLIGHT_SCRIPTS, *others))
+    scripts = (*FLIGHT_SCRIPTS, "live.js", "drop.js", "scene.js")
+    text = "\n".join((folder / name).read_text("utf-8") for name in scripts)
     names = re.findall(r"(?m)^(?:const|let|class|(?:async )?function) (\w+)", text)
     assert len(names) > 30 and len({*names}) == len(names)
-
-
-def test_page_holds_the_scenes_as_exactly_as_spz_can(written, rooms, tmp_path):
-    stage = FlightFrame.of(rooms[0], room_views())
-    for found, room in zip(scenes_in(written, tmp_path), rooms, strict=True):
-        given = in_units(room, stage.centre, stage.size)
-        assert len(found) == len(room) and found.sh_degree == room.sh_degree
-        assert (found.means - given.means).abs().max() <= 0.51 / 4096
-        assert (found.alphas - given.alphas).abs().max() < 0.6 / 255
 
 
 def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
@@ -91,9 +81,7 @@ def test_too_large_a_page_leaves_the_larger_scene_out_and_says_so(written, rooms
     "scenes, options, error, words",
     [
         ([], {}, ps.PointSplatError, "0 scenes for .*; expected one or two"),
-        ([ball(9)] * 3, {}, ps.PointSplatError, "3 scenes for .*; expected one or two"),
         ([ball(9)] * 2, {"names": ["one"]}, ps.PointSplatError, "1 names for 2 scenes; expected one for each"),
-        ([ball(9)], {"limit_mb": 0}, ps.PointSplatError, "a page of at most 0 MB; expected a number above 0"),
         ([ball(9)], {"limit_mb": 0.01}, ps.PointSplatError, r"the page would have 0\.\d MB, more than the 0.01 MB"),
         ([ball(9)], {"limit_mb": math.nan}, ps.PointSplatError, "a page of at most nan MB"),
         ([ball(9).map(lambda v: v * math.nan)], {}, ps.SceneError, "none of the 9 Gaussians can be drawn"),
@@ -107,12 +95,6 @@ def test_what_cannot_be_shown_is_refused_in_one_line(scenes, options, error, wor
     assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
 
 
-def test_a_page_that_cannot_be_written_is_an_error_of_the_scene(tmp_path):
-    (tmp_path / "folder.html").mkdir()
-    with pytest.raises(ps.SceneError, match="is a folder"):
-        ps.write_page(ball(9), tmp_path / "folder.html")
-
-
 def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_path, caplog):
     scene = ball(200)
     means = scene.means.clone()
@@ -124,16 +106,11 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     assert len(shown) == 197 and shown.means.abs().max() < 2047
 
 
-def ball_seen_from(eyes: list[list[float]], targets: list[list[float]]) -> ps.Views:
-    """Views over orange of 64 x 40 pixels, antialiased."""
-    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(len(eyes), 1, 1)
-    viewmats = look_at(torch.tensor(eyes), torch.tensor(targets))
-    return ps.Views(viewmats, K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
-
-
 def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
     scene = ball(300)
-    views = ball_seen_from([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[12.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
+    viewmats = look_at(torch.tensor([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), torch.tensor([[12.0, 0.0, 0.0], [0.0] * 3]))
+    views = ps.Views(viewmats, K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
     stage = FlightFrame.of(scene, views)
     data = stage.data([])
     assert data["drag"] == "orbit" and len(data["views"]) == 3
@@ -158,28 +135,15 @@ def test_rooms_are_looked_around_in_and_up_is_where_cameras_have_it():
     assert turned.up.direction.tolist() == [0.0, 0.0, -1.0]
 
 
-SEED = 3
-
-noise = np.random.default_rng(SEED).integers(0, 256, (12, 48, 64, 3), dtype=np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [(None, "No such file"), (b"GIF89a", "not a PNG"), ("cut", "cannot be read"), ("wide", "48 x 64")],
-)
-def test_a_picture_that_cannot_be_used_is_one_line_with_its_path(tmp_path, content, found):
-    path = tmp_path / "a.png"
+@pytest.mark.parametrize("content", [None, b"GIF89a", "cut", "wide"])
+def test_a_picture_that_cannot_be_used_is_none(tmp_path, content):
+    path, noise = tmp_path / "a.png", np.random.default_rng(3).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path)
+    assert np.array_equal(read_png(path, 64, 48), noise)
     if content == "wide":
-        Image.fromarray(noise[0].transpose(1, 0, 2)).save(path)
-    elif content == "cut":
-        Image.fromarray(noise[0]).save(path)
-        path.write_bytes(path.read_bytes()[:200])
-    elif content is not None:
-        path.write_bytes(content)
-    with pytest.raises(DataError) as error:
-        read_png(path, 64, 48)
-    Image.fromarray(noise[0]).save(path)
-    assert np.array_equal(read_png(path, 64, 48), noise[0])
-    text = str(error.value)
-    assert text.startswith(str(path)) and found in text and "expected a PNG picture of 64 x 48" in text
-    assert "\n" not in text
+        Image.fromarray(noise.transpose(1, 0, 2)).save(path)
+    else:
+        path.write_bytes(path.read_bytes()[:200] if content == "cut" else content or b"")
+    if content is None:
+        path.unlink()
+    assert read_png(path, 64, 48) is None

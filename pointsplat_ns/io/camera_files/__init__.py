@@ -167,5 +167,5 @@ def _json_cameras(path: Path) -> CameraFile:
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return nerfstudio_cameras(content, path)
     if isinstance(content, dict) and "camera_path" in content:
-        raise DataError(f"{path}: a camera path of nerfstudio's viewer, for `render --path`; expected {CAMERA_KINDS}")
+        raise DataError(f"{path}: a path for `ns-render camera-path`; expected {CAMERA_KINDS}")
     raise DataError(f"{path}: JSON without a list of cameras; expected {CAMERA_KINDS}")

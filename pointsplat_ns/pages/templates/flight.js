@@ -1,10 +1,6 @@
 // The stage of a page: one scene to fly through, or two that a wipe parts, drawn by splats.js as the camera of camera.js
 // sees them. It draws only when something has changed; while it moves, with fewer pixels if the machine is slow.
 
-const SLOW = 60; // milliseconds a frame, from which on fewer pixels are drawn while it moves
-const COARSEST = 0.25;
-const MOST_PIXELS = 2; // of the screen for each of the page, each way
-
 class Flight {
   // `data` is what pointsplat_ns/pages/flight.py gives. The stage says why where nothing can be drawn.
   constructor(root, data) {
@@ -179,7 +175,7 @@ class Flight {
   }
 
   resize() {
-    const scale = Math.min(devicePixelRatio, MOST_PIXELS), { clientWidth, clientHeight } = this.canvas;
+    const scale = Math.min(devicePixelRatio, 2), { clientWidth, clientHeight } = this.canvas;
     const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * scale)));
     if (width === this.canvas.width && height === this.canvas.height) return;
     [this.canvas.width, this.canvas.height] = [width, height];
@@ -223,7 +219,7 @@ class Flight {
     if (frames < 4) return;
     const mean = (now - first) / frames;
     this.part.rate.textContent = `${Math.round(1000 / mean)} frames/s`;
-    if (mean > SLOW && this.detail > COARSEST) {
+    if (mean > 60 && this.detail > 0.25) {
       this.detail /= 2;
       this.times = [];
     }

@@ -1,6 +1,6 @@
 // Draws Gaussians with WebGL 2 by the formulas and thresholds of pointsplat_ns/rasterizer: the covariance is projected
 // by the Jacobian at the mean (EWA splatting), 0.3 pixels^2 are added to it, and what has an alpha of 1/255 or more is
-// blended, from back to front. Where that is possible, colours are summed up in 16-bit floats.
+// blended, from back to front. Colours are summed up in 16-bit floats.
 
 const GAUSSIAN_SHADER = `#version 300 es
 precision highp float;
@@ -205,13 +205,12 @@ class Sorting {
 }
 
 class Drawer {
-  // Throws an error that says why where there is no WebGL 2.
+  // Throws an error that says why where there is no such WebGL 2.
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-    if (!gl) throw new Error("This browser offers no WebGL 2, which draws the scene. Another browser, or one with a graphics driver, shows it.");
+    const isFloat = gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float");
+    if (!isFloat) throw new Error("This browser offers no WebGL 2 with float colours, which draws the scene. Another browser, or one with a graphics driver, shows it.");
     this.gl = gl;
-    const isFloat = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
-    this.format = isFloat ? gl.RGBA16F : gl.RGBA8;
     this.gaussian = this.program(GAUSSIAN_SHADER, BLEND_SHADER);
     this.copy = this.program(WHOLE_SHADER, COPY_SHADER);
     this.image = gl.createTexture();
@@ -270,8 +269,7 @@ class Drawer {
     const { gl } = this;
     [this.width, this.height] = [width, height];
     gl.bindTexture(gl.TEXTURE_2D, this.image);
-    const type = this.format === gl.RGBA8 ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT;
-    gl.texImage2D(gl.TEXTURE_2D, 0, this.format, width, height, 0, gl.RGBA, type, null);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
