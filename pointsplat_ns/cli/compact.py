@@ -31,7 +31,7 @@ def compact(
     output: options.Output = None,
     goal: Annotated[GoalName | None, tyro.conf.arg(name="for")] = None,
     keep: str | None = None,
-    refiner: Annotated[Path | None, tyro.conf.arg(aliases=["--using"])] = None,
+    refiner: Path | None = None,
     by: str | None = None,
     sh: options.Bands = "all",
     clean: bool = False,
@@ -45,10 +45,8 @@ def compact(
     data: options.Data = None,
     picture: Path | None = None,
     html: Path | None = None,
-    dry_run: bool = False,
     force: options.Force = False,
     jobs: options.Jobs = None,
-    threads: options.Threads = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
@@ -73,7 +71,7 @@ def compact(
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
             default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
-            a .safetensors file, or shipped; by default none. --using is the same.
+            a .safetensors file, or shipped; by default none.
         by: the method of prune; by default the method of the refiner's training; without a refiner merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
@@ -90,12 +88,10 @@ def compact(
             folder, all scenes before and after; by default none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them; for a folder, a gallery of all scenes before and after; by default none.
-        dry_run: compute and print everything, but write no scene.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes
-    from pointsplat_ns.system.threads import fixed_threads
 
     chosen = GOALS[goal]
     unasked = goal is None and keep is None and refiner is None and target_db is None
@@ -103,16 +99,15 @@ def compact(
     if is_folder_of_scenes(scene):
         from pointsplat_ns.folders import output_folder
 
-        for name, given in {"--poses": poses, "--up": up, "--photos": photos, "--dry-run": dry_run}.items():
+        for name, given in {"--poses": poses, "--up": up, "--photos": photos}.items():
             if given is not None and given is not False:
                 raise ps.SceneError(f"{name} is for one scene; {scene} is a folder of scenes")
         folder = output or output_folder(scene)
-        with fixed_threads(threads):
-            results = ps.compact_folder(
-                scene, folder, keep, refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-                target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
-                picture=picture, jobs=1 if jobs is None else jobs, force=force, progress=True,
-            )  # fmt: skip
+        results = ps.compact_folder(
+            scene, folder, keep, refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
+            target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
+            picture=picture, jobs=1 if jobs is None else jobs, force=force, progress=True,
+        )  # fmt: skip
         return _print_folder(results, folder, [path for path in (html, picture) if path is not None], json_output)
     if jobs is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
@@ -125,23 +120,18 @@ def compact(
 
     options.check_poses(poses)
     output = file_for(goal, scene, output)
-    written = None if dry_run else output
-    alone = chosen.page and html is None and not dry_run
+    alone = chosen.page and html is None
     html = output.with_suffix(".html") if alone else html
-    options.check_outputs(written, force, picture, html)
-    kind = format_to_write(output)
-    request = CompactRequest.of(
-        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.suffix, target_db
-    )
+    options.check_outputs(output, force, picture, html)
+    budget, suffix = RepairBudget(effort, seconds), format_to_write(output).suffix
+    request = CompactRequest.of(refiner_at(refiner), keep, by, sh, clean, budget, bool(photos), suffix, target_db)
     looking = Looking(poses, resolution, up, data, photos)
-    with fixed_threads(threads):
-        dense, result, source = compact_source(scene, request, looking, progress=True)
-    if not dry_run:
-        ps.save(result.scene, output, progress=True, overwrite=True)
-    quality = quality_of_file(dense, source, result.scene, written, kind.suffix)
+    dense, result, source = compact_source(scene, request, looking, progress=True)
+    ps.save(result.scene, output, progress=True, overwrite=True)
+    quality = quality_of_file(dense, source, result.scene, output)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)
-    files = [_file_text(scene), "not written" if written is None else _file_text(written)]
+    files = [_file_text(scene), _file_text(output)]
     shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
     if html is not None:
         _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
@@ -153,20 +143,20 @@ def compact(
             "picture": picture,
             "html": html,
         }
-        print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
+        print_json({**scene_result(len(dense), result.scene, result.seconds, output), **made})
         return end_if_interrupted(result.interrupted)
     also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
     also += ["trained on photos"] * (result.last.photos is not None)
-    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
-    print_if_larger(scene, written)
+    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, output, quality)
+    print_if_larger(scene, output)
     if verbose and quality is not None:
         print(quality.details)
     if shown is not None:
         print(shown)
     print_use(goal, html, name_of(scene), quality)
     end_if_interrupted(result.interrupted)
-    if unasked and written is not None:
-        print_next(scene, written, quality)
+    if unasked:
+        print_next(scene, output, quality)
 
 
 def _print_folder(results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool) -> None:

@@ -56,17 +56,7 @@ Jobs = Annotated[
         "cores; by default 1."
     ),
 ]
-Threads = Annotated[
-    int | None,
-    tyro.conf.arg(
-        help="number of threads of each process. By default it adapts to the work and to other programs. Another "
-        "number may change results by rounding."
-    ),
-]
-Verbose = Annotated[
-    bool,
-    tyro.conf.arg(help="print more: what was chosen for the scene."),
-]
+Verbose = Annotated[bool, tyro.conf.arg(help="print more: what was chosen for the scene.")]
 Json = Annotated[
     bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")
 ]

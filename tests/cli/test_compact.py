@@ -84,9 +84,6 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     assert titles[0].splitlines()[2:] == files[:1]
     assert titles[-1].splitlines()[2:] == [files[1], *quality.split(": ")]
     assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
-    run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--force")
-    names = [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]]
-    assert names == [f"dense ({files[0]})", "compact (not written)"]
 
 
 @pytest.mark.parametrize("goal", [name for name in GOALS if name])

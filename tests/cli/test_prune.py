@@ -66,14 +66,12 @@ def test_a_small_scene_stays_in_its_format_or_its_growth_is_said(suffix, ply, tm
     assert f"note: {tmp_path / 'large.ply'} is larger than {scene}: " in capsys.readouterr().out
 
 
-def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
-    before = sorted(tmp_path.iterdir())
-    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run")
+def test_details_are_said_where_they_are_asked_for(ply, capsys):
+    words = ("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0")
+    run(*words)
     said = capsys.readouterr().out
-    assert sorted(tmp_path.iterdir()) == before
-    assert "dry run, nothing is written: pruned by coverage to 20 of 80 Gaussians (25 %)" in said
-    assert "SH degree" not in said
-    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run", "--verbose")
+    assert "pruned by coverage to 20 of 80 Gaussians (25 %)" in said and "SH degree" not in said
+    run(*words, "--force", "--verbose")
     assert "SH degree 3 cut to 0: colours change 100% less with the view" in capsys.readouterr().out
 
 
@@ -83,7 +81,6 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
         (("--by", "best"), f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
         (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
         (("--keep", "half"), "keep is 'half'"),
-        (("--plot", "out.jpg"), "ends in .png"),
     ],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 
 import pytest
 import torch
@@ -11,7 +10,6 @@ import pointsplat_ns as ps
 from making import ball, box_room, same
 from pointsplat_ns.cli import main
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.compression.pictures import opacity_quantiles, plot_distributions, size_quantiles
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.gaussians import Gaussians
@@ -73,16 +71,6 @@ def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, v
     result = pruned(strong, views, 1.0, "paper", sh="auto")
     assert result.scene.sh_degree == 1
     assert result.notes == ("views: given views", "SH degree 1 kept")
-
-
-def test_distributions_are_numbers_and_a_picture(scene, tmp_path):
-    assert opacity_quantiles(scene)[1] == pytest.approx(float(scene.alphas.median()), abs=0.01)
-    assert size_quantiles(scene) == sorted(size_quantiles(scene))
-    assert all(math.isnan(value) for value in size_quantiles(scene[:0]) + opacity_quantiles(scene[:0]))
-    flat = scene.replace(scales=torch.full_like(scene.scales, -math.inf))
-    for i, after in enumerate((scene[:50], scene[:1], scene[:0], flat)):
-        plot_distributions({"before": scene, "after": after}, tmp_path / f"{i}.png")
-        assert (tmp_path / f"{i}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_merging_stands_upright_in_views_that_are_sampled_for_it():

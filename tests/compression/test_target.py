@@ -9,7 +9,7 @@ import pytest
 import pointsplat_ns as ps
 from making import box_room
 from pointsplat_ns.compression import compact, target_search
-from pointsplat_ns.compression.quality import decibels, quality_of_file
+from pointsplat_ns.compression.quality import Judge, decibels, quality_of_file, through_file
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.files import bytes_text
@@ -44,13 +44,13 @@ def test_the_file_that_is_written_has_the_quality_and_few_gaussians(dense, views
     path = tmp_path / f"found{suffix}"
     ps.save(found.scene, path)
     assert mean_psnr(ps.load(path), dense, views) >= 25 - 1e-3, "sums in another order"
-    said = quality_of_file(dense, ViewSource(dense), found.scene, path, suffix)
+    said = quality_of_file(dense, ViewSource(dense), found.scene, path)
     assert said.psnr >= 25
     reached = f"{decibels(said.psnr)} against the dense scene in 3 views of 48 x 36 pixels"
     assert found.target.startswith(f"{reached}, {bytes_text(path.stat().st_size)}, {len(found.scene):,} Gaussians; ")
     assert (found.stages[-1].name == "round") == (suffix != ".ply")
     fewer = ps.compact(dense, round(0.85 * len(found.scene)), by="opacity")  # which is not rounded
-    assert quality_of_file(dense, ViewSource(dense), fewer.scene, None, suffix).psnr < 25
+    assert Judge(dense, ViewSource(dense)).psnr(through_file(fewer.scene, suffix)[1])[0] < 25
 
 
 def test_each_count_is_repaired_and_has_the_sh_bands_that_are_asked_for(dense, monkeypatch):

@@ -111,7 +111,6 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
         found[suffix] = ps.load(folder / f"room{suffix}")
     found["info"] = ps.info(scene)
     ps.plot_views(room, folder / "views.png", views=views)
-    ps.plot_distributions({"before": room, "after": compacted.scene}, folder / "distributions.png")
     ps.write_page(room, folder / "room.html", views=views)
     files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     return {name: plain(value) for name, value in found.items()} | files
