@@ -298,7 +298,8 @@ class _Compacting:
         scene = made.scene
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
-        judge = None if same and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
+        differs = not same or kind.suffix != ".ply"
+        judge = (made.judge or judge_of(dense, source)) if differs else None
         with replacing(task.output) as part:
             save_as(kind, scene, part, name=task.output)
             written = read_back(scene, part, kind)

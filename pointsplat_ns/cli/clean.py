@@ -33,7 +33,7 @@ def clean(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import Looking, clean_source
-    from pointsplat_ns.compression.quality import quality_of_file
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
 
     options.need_one_scene(scene)
     options.check_poses(poses)
@@ -42,7 +42,7 @@ def clean(
     looking = Looking(poses, resolution, up, data)
     dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
     ps.save(cleaned, output, progress=True, overwrite=True)
-    quality = quality_of_file(dense, source, cleaned, output)
+    quality = quality_of_file(judge_of(dense, source), cleaned, output)
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})

@@ -112,7 +112,7 @@ def compact(
     if jobs is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
     from pointsplat_ns.compacting import Looking, compact_source
-    from pointsplat_ns.compression.quality import quality_of_file
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
     from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
@@ -128,7 +128,7 @@ def compact(
     looking = Looking(poses, resolution, up, data, photos)
     dense, result, source = compact_source(scene, request, looking, progress=True)
     ps.save(result.scene, output, progress=True, overwrite=True)
-    quality = quality_of_file(dense, source, result.scene, output)
+    quality = quality_of_file(result.judge or judge_of(dense, source), result.scene, output)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)
     files = [_file_text(scene), _file_text(output)]

@@ -54,7 +54,7 @@ def prune(
     from pointsplat_ns.compacting import Looking, prune_source
     from pointsplat_ns.comparing.sizes import parse_resolution
     from pointsplat_ns.compression.prune_file import prune_file, rows_to_prune
-    from pointsplat_ns.compression.quality import quality_of_file
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.ply import PlyRows
@@ -76,7 +76,7 @@ def prune(
         dense, small, seconds, source = prune_source(scene, request, looking, progress=True)
         before = len(dense)
         ps.save(small, output, progress=True, overwrite=True)
-        quality = quality_of_file(dense, source, small, output)
+        quality = quality_of_file(judge_of(dense, source), small, output)
     elif photos is not False:
         raise ps.SceneError(f"{scene}: does not fit into memory; expected no --photos")
     else:

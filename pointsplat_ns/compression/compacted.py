@@ -9,7 +9,7 @@ from typing import Literal
 from pointsplat_ns.comparing.closeness import Closeness, DenseReference
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, Reason, closer_in
 from pointsplat_ns.compression.photo_repair import PhotoRepaired
-from pointsplat_ns.compression.quality import PhotoGain
+from pointsplat_ns.compression.quality import Judge, PhotoGain
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.views import Views
 
@@ -65,6 +65,8 @@ class Compacted:
     """Why there are no views to compare renders in; empty if there are."""
     target: str = ""
     """Text on the search for a PSNR: what was reached, and its cost; empty if there was no search."""
+    judge: Judge | None = None
+    """The judge of a search for a PSNR; None if there was no search."""
     interrupted: bool = False
     """Whether Ctrl-C ended the repair or the search for a PSNR early."""
 

@@ -7,6 +7,7 @@ or cleaning that removes a Gaussian.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -144,23 +145,27 @@ def _for_psnr(
 ) -> tuple[Gaussians, FileLimit | None, str]:
     """The smallest scene with a PSNR against ``dense``; if a format rounds its numbers, the limit of its file: the
     scene has the PSNR when it is rounded; and a line on the search. ``make(n)`` returns n Gaussians."""
-    from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
+    from pointsplat_ns.compression.budget_search import FileLimit, share_done, smallest_within
     from pointsplat_ns.compression.quality import Judge, decibels, through_file
 
     assert isinstance(budget, WithinPsnr)
     judge, kind = Judge(dense, views), format_to_write(budget.suffix)
     limit = None if kind.rounded is None else FileLimit(kind, math.inf, rounding_for(budget.value, dense.sh_degree))
 
-    def psnr_of(scene: Gaussians, progress: Callable[[float], None]) -> tuple[float, float]:
-        rounded = scene if limit is None else limit.rounded(scene)
-        return judge.psnr(through_file(rounded, budget.suffix)[1], progress)
+    numbers = itertools.count()
 
-    reached = smallest_within(len(dense), make, psnr_of, budget.value, progress)
+    def measure(count: int) -> tuple[float, tuple[Gaussians, float, float]]:
+        scene, before = make(count), next(numbers)
+        _, written = through_file(scene if limit is None else limit.rounded(scene), budget.suffix)
+        psnr, worst = judge.psnr(written, lambda share: progress(share_done(before + share)))
+        return psnr, (scene, psnr, worst)
+
+    (scene, psnr, worst), found = smallest_within(len(dense), measure, budget.value)
     note = (
-        f"{counted(len(reached.tried), 'size')} tried: {decibels(reached.psnr)} against the dense scene, "
-        f"{decibels(reached.worst)} in the worst of {views_text(len(judge.views))}"
+        f"{counted(len(found.tried), 'size')} tried: {decibels(psnr)} against the dense scene, "
+        f"{decibels(worst)} in the worst of {views_text(len(judge.views))}"
     )
-    return reached.scene, limit, note
+    return scene, limit, note
 
 
 def _for_size(
@@ -181,5 +186,5 @@ def _for_size(
         found = largest_within(start, make, limit, progress, lambda scene: reference.psnr(scene)[0])
     except DataError:  # no views
         found = largest_within(start, make, limit, progress)
-    note = f"{counted(len(found.tried), 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}"
-    return found.scene, found.limit, note
+    scene, rounded, tries = found
+    return scene, rounded, f"{counted(tries, 'size')} tried for {bytes_text(limit.most)} as {limit.kind.name}"

@@ -198,9 +198,8 @@ class Judge:
         return scene.at_offset(self.dense.offset).to(self.dense.device)
 
 
-def quality_of_file(dense: Gaussians, source: ViewSource, scene: Gaussians, path: Path) -> Quality | None:
-    """The quality of a scene as it is in the file that it was written to; None if there is no place to look from."""
-    judge = judge_of(dense, source)
+def quality_of_file(judge: Judge | None, scene: Gaussians, path: Path) -> Quality | None:
+    """The quality of a scene as it is in the file that it was written to; None without a judge."""
     return None if judge is None else judge.quality(read_back(scene, path, format_to_write(path)))
 
 
