@@ -8,7 +8,7 @@ import math
 import time
 
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason
+from pointsplat_ns.compression.acceptance import ACCEPTANCE, SMALL_GAIN, Comparison
 from pointsplat_ns.compression.budget_search import FileLimit
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
 from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
@@ -54,11 +54,11 @@ def compact_scene(
         judge = Comparison(at_work, views)
         reference = judge.reference
     except DataError as error:
-        uncompared = str(error)
+        uncompared = f"it cannot be compared with the dense scene ({error})"
     before = None if reference is None else reference.closeness(pruned.scene.to(at_work.device))
     stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
-        stages.append(_refined(stages[0], request.refiner, judge, progress))
+        stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
     error_left = last_kept(stages).after
     if judge is not None and error_left is not None and error_left.psnr < math.inf and not request.repair.empty:
         stages.append(_repaired(last_kept(stages), at_work, request.repair, judge, views, progress))
@@ -73,14 +73,17 @@ def compact_scene(
     return Compacted(tuple(stages), (*seen, *pruned.notes), reference, seconds, uncompared, interrupted=interrupted)
 
 
-def _refined(last: Stage, refiner: TrainedRefiner, judge: Comparison | None, progress: Progress) -> Stage:
+def _refined(
+    last: Stage, refiner: TrainedRefiner, judge: Comparison | None, uncompared: str, progress: Progress
+) -> Stage:
     """The refinement of the last stage by a network."""
     progress("refining", 0.0)
     refined = refiner(last.scene)
-    if bool((last.scene.usable() & ~refined.usable()).any()):
-        return Stage("refine", refined, None, last.after, reason=Reason.NOT_FINITE)
+    unsound = int((last.scene.usable() & ~refined.usable()).sum())
+    if unsound:
+        return Stage("refine", refined, None, last.after, f"{unsound:,} of {len(refined):,} Gaussians are not finite")
     if judge is None or last.after is None:
-        return Stage("refine", refined, None, reason=Reason.NOT_COMPARED)
+        return Stage("refine", refined, None, reason=uncompared)
     after, reason = judge.judged(last.after, last.scene, refined, progress)
     return Stage("refine", refined, after, last.after, reason)
 
@@ -111,8 +114,8 @@ def _trained(
     progress("training on photos", 0.0)
     report = functools.partial(progress, "training on photos")
     trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = None if trained.lost <= PHOTO_REPAIR.most_lost else Reason.NO_GAIN
-    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else Reason.SMALL_GAIN  # NaN too
+    reason = "" if trained.lost <= PHOTO_REPAIR.most_lost else f"other photos lose {trained.lost:.1f} dB"
+    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else SMALL_GAIN  # NaN too
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
     return Stage("photos", scene, after, last.after, reason, *figures, photos=trained)
