@@ -24,7 +24,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.levels import DEFAULT_LEVELS, LevelOutput, Levels, make_levels, parse_levels
+from pointsplat_ns.levels.levels import LevelOutput, Levels, make_levels, parse_levels
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
@@ -219,7 +219,7 @@ def compact(
 @normal_mode
 def lod(
     scene: Source,
-    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
+    levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),
     *,
     sh: str = "all",
     views: Views | str | Path | None = None,
@@ -269,14 +269,14 @@ def lod(
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
-    PruneRequest(1.0, sh=sh)
+    request = PruneRequest(1.0, sh=sh)
     output = LevelOutput.of(folder, stream, tiles, at, up, force)
     if output is not None:
         output.check(len(budgets))
     dense, view_source = read_source(scene, Looking(views, resolution, up, data))
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
-        made = make_levels(dense, levels, sh, view_source, source, report)
+        made = make_levels(dense, budgets, request, view_source, source, report)
         made = made if output is None else output.write(made, report)
     log(made.notes)
     return made

@@ -21,7 +21,7 @@ from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, Quality
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
-from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
+from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
@@ -36,11 +36,9 @@ from pointsplat_ns.levels.tiles import TILESET, placed, write_tiles
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
-from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
+from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.views import Views
-
-DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +230,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
         raise BudgetError("no level given; expected at least one, such as 50%")
     parsed: list[tuple[str, Keep]] = []
     for level in levels:
-        text = level if isinstance(level, str) else _text(level)
+        text = str(level)
         try:
             budget = parse_keep(level) if isinstance(level, str) else level
         except BudgetError as error:
@@ -245,11 +243,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
     return parsed
 
 
-def _text(level: Keep) -> str:
-    return str(level) if isinstance(level, (Megabytes, WithinPsnr)) else repr(level)
-
-
-def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits = PLAIN) -> list[int]:
+def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits) -> list[int]:
     """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
     the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
@@ -266,36 +260,32 @@ def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits:
 
 def make_levels(
     dense: Gaussians,
-    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
-    sh: str = "all",
-    views: ViewSource | None = None,
-    source: SourceFile | None = None,
-    progress: Progress = silent,
+    levels: list[tuple[str, Keep]],
+    request: PruneRequest,
+    views: ViewSource,
+    source: SourceFile | None,
+    progress: Progress,
 ) -> Levels:
     """Make levels of detail in one pass, and measure each level as soon as it is made.
 
     Args:
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
-        levels: see :func:`parse_levels`; in any order.
-        sh: SH bands of every level, as for :class:`~pointsplat_ns.compression.requests.PruneRequest`.
-        views: source of the views to compare renders in; merging uses them too where they are known. By default views
-            are sampled.
+        levels: of :func:`parse_levels`; in any order.
+        request: for all Gaussians; its SH bands are those of every level.
+        views: source of the views to compare renders in; merging uses them too where they are known.
         source: the file of ``dense``, for the manifest.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn.
-        DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown.
+        DataError: if the SH bands need views and there are none.
     """
-    budgets = parse_levels(levels)
     need_usable(dense)
     dense = keep_usable(dense, "the dense scene")
-    views = views or ViewSource(dense)
     progress("rendering the dense scene", 0.0)
-    cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
-    counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.traits)
+    cut = prune_scene(dense, request, views)
+    counts = level_counts(levels, len(dense), cut.scene.sh_degree, dense.traits)
     notes, compared, judge = cut.notes, None, None
     try:
         judge, compared = Judge(dense, views), views.compared()
@@ -308,14 +298,8 @@ def make_levels(
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
         progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
-        made.append(
-            Level(
-                scene=merged.scene,
-                assignment=merged.assignment,
-                dropped=int((merged.assignment < 0).sum()),
-                quality=None if judge is None else judge.quality(merged.scene),
-                seconds=seconds,
-            )
-        )
+        quality = None if judge is None else judge.quality(merged.scene)
+        dropped = int((merged.assignment < 0).sum())
+        made.append(Level(merged.scene, merged.assignment, dropped, quality, seconds))
         start = time.perf_counter()
     return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)
