@@ -161,15 +161,13 @@ def compact_source(
     Returns:
         The dense scene, the result, and the source of its views, to judge it in.
     """
+    from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
+
     dense, source, photos = _read_photographed(scene, looking, progress)
     with progress_bar(progress) as report:
         if request.target_db is None:
-            from pointsplat_ns.compression.compact import compact_scene
-
             result = compact_scene(dense, request, source, report, photos.training)
         else:
-            from pointsplat_ns.compression.target_search import compact_to_psnr
-
             result = compact_to_psnr(dense, request, source, report)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
     log(tuple(filter(None, [result.target])))

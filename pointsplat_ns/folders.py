@@ -23,10 +23,9 @@ from typing import Any, Literal
 import torch
 
 from pointsplat_ns.comparing.sizes import parse_resolution, size_text
-from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
 from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.target_search import compact_to_psnr
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians

@@ -37,7 +37,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import View, Views
 
 PLACES = 16
-"""Number of places of cameras. More places remove less and take longer."""
+"""Number of places of cameras: more remove less and take longer."""
 
 FLOATING = 0.25
 """Largest difference in colour, root of the sum of squares of red, green and blue, of a Gaussian that floats right
@@ -104,7 +104,10 @@ def find_junk(
             views = _views_all_around(part)
         except DataError:
             return Junk(undrawable.cpu(), drawn[:0].cpu(), drawn[:0].cpu(), 0)
-        has_pixels = _has_pixels(part, views, progress)
+        has_pixels = torch.zeros_like(drawn, dtype=torch.bool)
+        for done, pixels in enumerate(each_view(part, views, pixels_of)):
+            has_pixels |= pixels > 0
+            progress("looking for unseen Gaussians", (done + 1) / len(views))
         places = len(views) // 6
         visible[drawn] = has_pixels | ~has_pixels.any()  # empty images are no evidence
     floats = order[:0]
@@ -163,15 +166,6 @@ def clusters(scene: Gaussians) -> Tensor:
     links = coo_matrix((torch.ones(len(first), **DOUBLES), (first, near[first, rank])), (len(scene), len(scene)))
     labels = torch.from_numpy(connected_components(links, directed=False)[1]).long()
     return labels.bincount().argsort(descending=True, stable=True).argsort()[labels]
-
-
-def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
-    """Whether each Gaussian (N,) has a blend weight on any pixel of any view."""
-    has_pixels = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-    for done, pixels in enumerate(each_view(scene, views, pixels_of)):
-        has_pixels |= pixels > 0
-        progress("looking for unseen Gaussians", (done + 1) / len(views))
-    return has_pixels
 
 
 def clean_scene(
@@ -235,7 +229,9 @@ def _views_all_around(scene: Gaussians) -> Views:
     # few of the likeliest are behind walls; views for comparisons have another seed
     views = Sampler(without_sh).views(PLACES, seed=17, likeliest=True)
     places = invert_rigid(views.viewmats)[:, :3, 3]
-    rotations = _six_directions().to(places)
+    forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
+    right = forward.roll(1, dims=1)
+    rotations = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1).to(places)  # OpenCV axes
     viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
@@ -245,11 +241,3 @@ def _views_all_around(scene: Gaussians) -> Views:
     K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], **FLOATS)
     viewmats = viewmats.flatten(0, 1)
     return Views(viewmats, K.repeat(len(viewmats), 1, 1), side, side, torch.zeros(3, **FLOATS))
-
-
-def _six_directions() -> Tensor:
-    """World-to-camera rotations (6, 3, 3) of the faces of a cube, OpenCV axes."""
-    forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
-    right = forward.roll(1, dims=1)
-    down = torch.linalg.cross(forward, right)
-    return torch.stack([right, down, forward], dim=1)

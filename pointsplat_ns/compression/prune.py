@@ -33,11 +33,9 @@ from pointsplat_ns.pruning import (
 )
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.quantities import counted
-from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.budget_search import FileLimit
-    from pointsplat_ns.compression.cleaning import Cleaning
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +79,17 @@ def prune_scene(
     elif count is not None:
         scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
     else:
-        merger = Merger(start, views.for_merging()) if merging else None
-        make = _selector(start, request, scored, report) if merger is None else lambda k: merger.merged(k).scene
-        if cleaning is not None:
-            make = _refilling(make, cleaning, full, len(start))
+        if merging:
+            merger = Merger(start, views.for_merging())
+        else:
+            report(0.0)
+            scores = score_of(start, request.method, scored, request.opacity_weight, report)
+
+        def make(count: int) -> Gaussians:
+            if cleaning is not None and count > len(start):
+                return cleaning.apply(full, count)  # with the most opaque of the junk
+            return merger.merged(count).scene if merging else start[select(scores, count)]
+
         searching = functools.partial(progress, "trying counts")
         if isinstance(request.budget, Megabytes):
             scene, limit, searched = _for_size(dense, start, make, request.budget, views, searching)
@@ -117,23 +122,6 @@ def _with_sh(dense: Gaussians, sh: str, views: ViewSource, progress: Progress) -
     lost = energy_lost(dense, degree)
     cut = f"SH degree {dense.sh_degree} cut to {degree}"
     return cut_sh(dense, degree), f"{cut}: colours change {lost:.0%} less with the view{reached}"
-
-
-def _selector(
-    scene: Gaussians, request: PruneRequest, views: Callable[[], Views], progress: Callable[[float], None]
-) -> Callable[[int], Gaussians]:
-    """A function from a count to so many Gaussians of the highest scores, which are computed once."""
-    progress(0.0)
-    scores = score_of(scene, request.method, views, request.opacity_weight, progress)
-    return lambda count: scene[select(scores, count)]
-
-
-def _refilling(
-    make: Callable[[int], Gaussians], cleaning: Cleaning, full: Gaussians, most: int
-) -> Callable[[int], Gaussians]:
-    """``make`` extended to counts above ``most``, the number of Gaussians in the cleaned scene. Such a scene gets the
-    most opaque of its junk back."""
-    return lambda count: make(count) if count <= most else cleaning.apply(full, count)
 
 
 def _for_psnr(

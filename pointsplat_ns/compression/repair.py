@@ -79,16 +79,9 @@ def repair(
                 factors = network(feedback.features(scene, run.done, expected))
         return first_factor * rate_factor(run.done), factors
 
-    def keep(after: Gaussians) -> None:
-        nonlocal scene
-        scene = after
-
-    run.take(
-        optimised(scene, feedback, _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped)), choose),
-        keep,
-        progress,
-    )
-    return Repaired(scene, run.count, run.seconds, run.interrupted)
+    examples = _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped))
+    last = run.take(scene, optimised(scene, feedback, examples, choose), progress)
+    return Repaired(last, run.count, run.seconds, run.interrupted)
 
 
 @dataclass
@@ -111,16 +104,13 @@ class OptimisationRun:
         return time.perf_counter() - self._start
 
     def take(
-        self,
-        scenes: Iterator[Gaussians],
-        each: Callable[[Gaussians], None],
-        progress: Callable[[float], None] | None = None,
-    ) -> None:
-        """Take steps until the budget is used, or Ctrl-C.
+        self, scene: Gaussians, scenes: Iterator[Gaussians], progress: Callable[[float], None] | None = None
+    ) -> Gaussians:
+        """The scene after the last step: take steps until the budget is used, or Ctrl-C.
 
         Args:
+            scene: the scene before the first step.
             scenes: the scene after each step, without end.
-            each: called with it.
             progress: called with the share done, in [0, 1].
         """
         try:
@@ -128,11 +118,11 @@ class OptimisationRun:
                 scene = next(scenes)
                 self.count += 1
                 self.done = self.budget.share_done(self.count, self.seconds)
-                each(scene)
                 if progress is not None:
                     progress(min(self.done, 1.0))
         except KeyboardInterrupt:
             self.interrupted = True
+        return scene
 
 
 def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:

@@ -121,15 +121,11 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
     return (refiner or load_refiner())(scene)
 
 
-SHIPPED = "shipped"
-"""Name of the shipped refiner, in place of a path."""
-
-
 def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
-    """The trained refiner at a path as for :func:`load_refiner`, or at :data:`SHIPPED`; None for None."""
+    """The trained refiner at a path as for :func:`load_refiner`, or the one that ships for "shipped"; None for None."""
     if path is None:
         return None
-    return load_refiner(None if str(path) == SHIPPED else path, device)
+    return load_refiner(None if str(path) == "shipped" else path, device)
 
 
 def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:

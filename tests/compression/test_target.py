@@ -8,7 +8,7 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room
-from pointsplat_ns.compression import compact, target_search
+from pointsplat_ns.compression import compact
 from pointsplat_ns.compression.quality import Judge, decibels, quality_of_file, through_file
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import PointSplatError
@@ -76,7 +76,7 @@ def test_ctrl_c_gives_the_smallest_scene_so_far_if_any_reaches_it(dense, monkeyp
         made.append(original(*args))
         return made[-1]
 
-    monkeypatch.setattr(target_search, "compact_scene", interrupted)
+    monkeypatch.setattr(compact, "compact_scene", interrupted)
     if not found:
         with pytest.raises(KeyboardInterrupt):
             ps.compact(dense, by="opacity", target_db=20.0)
