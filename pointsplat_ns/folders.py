@@ -25,7 +25,7 @@ import torch
 from pointsplat_ns.comparing.sizes import parse_resolution, size_text
 from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
-from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
 from pointsplat_ns.compression.trained_refiner import refiner_at
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -178,7 +178,7 @@ def compact_folder(
     ]
     _describe(target, options, force)
     drawn = (page, sheet) != (None, None)
-    work = _Compacting(request.prune, request.repair, target_db, refiner, size, data, options, drawn, force)
+    work = _Compacting(dataclasses.replace(request, refiner=None), refiner, size, data, options, drawn, force)
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
@@ -193,7 +193,7 @@ def compact_folder(
             if task.name not in results:  # its process may have ended while it wrote
                 for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
                     part.unlink(missing_ok=True)
-        rows = [results.get(task.name) or _known(task) for task in tasks]
+        rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
         write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
         if page is not None:
             write_gallery(page, folder.resolve().name, rows)
@@ -249,9 +249,7 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
 class _Compacting:
     """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
 
-    request: PruneRequest
-    repair: RepairBudget
-    target_db: float | None
+    request: CompactRequest  # without the refiner
     refiner: str | Path | None  # loaded by each process
     resolution: tuple[int, int] | None
     data: str | Path | None
@@ -275,12 +273,11 @@ class _Compacting:
                     f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
                     "name another folder, or overwrite it with --force"
                 )
-            finished = record is not None and whole and record["key"] == key
-            if not finished:
+            if record is None or not whole or record["key"] != key:
                 return self._make(task, source.bytes, key, start)
             if self.drawn and not pair_of(task.output).exists():
                 self._draw(task, read_scene(task.source), read_scene(task.output))
-            return _known(task)
+            return _known(task, record)
         except Exception as error:  # one scene must not stop the others
             kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
             return task.result("failed", seconds=time.perf_counter() - start, error=kind + one_line(error, limit=1000))
@@ -289,9 +286,9 @@ class _Compacting:
         """Write a result and its record. A process killed in between leaves the record alone: the scene is open."""
         dense, kind = read_scene(task.source), format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
-        request, trained = dataclasses.replace(self.request, suffix=kind.suffix), _loaded(self.refiner)
-        whole = CompactRequest(request, trained, self.repair, target_db=self.target_db)
-        made = (compact_scene if self.target_db is None else compact_to_psnr)(dense, whole, source)
+        prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
+        request = dataclasses.replace(self.request, prune=prune, refiner=_loaded(self.refiner))
+        made = (compact_scene if request.target_db is None else compact_to_psnr)(dense, request, source)
         if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         scene = made.scene
@@ -338,9 +335,8 @@ def _read_record(task: _Task) -> dict[str, Any] | None:
     return record if texts and numbers else None
 
 
-def _known(task: _Task) -> SceneResult:
-    """The result in a record."""
-    record = _read_record(task)
+def _known(task: _Task, record: dict[str, Any] | None) -> SceneResult:
+    """The result in a record; an open one without."""
     if record is None:
         return task.result("open")
     return task.result("done before", **{name: record[name] for name in (*FIGURES, "note")})

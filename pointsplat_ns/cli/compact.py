@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, replace
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from urllib.parse import quote
 
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.goals import GOALS, GoalName, file_for, print_next, print_use
 from pointsplat_ns.cli.printing import (
     end_if_interrupted,
     print_if_larger,
@@ -24,6 +26,36 @@ if TYPE_CHECKING:
     from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.folders import SceneResult
     from pointsplat_ns.gaussians import Gaussians
+
+GoalName = Literal["web", "phone", "headset", "email"]
+
+
+class Goal(NamedTuple):
+    """What a purpose asks for."""
+
+    suffix: str | None = None
+    """Suffix of the file; None for that of the scene."""
+    keep: str | None = None
+    """Budget; None for the usual one."""
+    page: bool = False
+    """Whether a page with the scene alone is written beside the file."""
+    page_mb: float = 60.0
+    """Largest page, in units of 10^6 bytes."""
+    use: str = "to fly through in a browser"
+    """Text on the use of a page."""
+
+
+GOALS: dict[GoalName | None, Goal] = {
+    None: Goal(),
+    "web": Goal(
+        ".sog", "2MB", True, use="to upload; paste this where the scene is to appear:\n"
+        '<iframe src="{url}" title="{name}" style="width: 100%; height: 30rem; border: 0" allowfullscreen></iframe>',
+    ),
+    "phone": Goal(".sog", "500000gaussians"),
+    "headset": Goal(".spz", "400000gaussians"),
+    "email": Goal(".spz", "5MB", True, 10.0, "to fly through after a double click, also offline"),
+}  # fmt: skip
+"""Sources of the figures: docs/guides/downloaded_splat.md."""
 
 
 def compact(
@@ -119,7 +151,11 @@ def compact(
     from pointsplat_ns.io.runs import name_of
 
     options.check_poses(poses)
-    output = file_for(goal, scene, output)
+    if output is not None and chosen.suffix is not None and not output.name.lower().endswith(chosen.suffix):
+        raise ps.SceneError(
+            f"{output}: --for {goal} writes {chosen.suffix}; expected such a name, or --keep in place of --for"
+        )
+    output = output or options.output_beside(scene, goal or "compact", chosen.suffix)
     alone = chosen.page and html is None
     html = output.with_suffix(".html") if alone else html
     options.check_outputs(output, force, picture, html)
@@ -153,10 +189,10 @@ def compact(
         print(quality.details)
     if shown is not None:
         print(shown)
-    print_use(goal, html, name_of(scene), quality)
+    _print_use(goal, html, name_of(scene), quality)
     end_if_interrupted(result.interrupted)
     if unasked:
-        print_next(scene, output, quality)
+        _print_next(scene, output, quality)
 
 
 def _print_folder(results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool) -> None:
@@ -216,3 +252,24 @@ def _write_page(
         shown, html, names, title=name_of(scene), notes=notes, views=None if sampled else result.views, up=up,
         limit_mb=limit_mb, progress=True,
     )  # fmt: skip
+
+
+def _print_use(goal: GoalName | None, page: Path | None, name: str, quality: Quality | None) -> None:
+    """Print what a page of the scene called ``name`` is for; for a headset, also the fill, which can slow it."""
+    if page is not None:
+        use = GOALS[goal].use.format(url=quote(page.name), name=escape(name))
+        print(f"{page}: {written_size(page)}, {use}")
+    if goal == "headset" and quality is not None:
+        fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
+        print(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
+
+
+def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
+    """Print two commands to try after a budget that nobody chose: a look at the result, and another budget where its
+    PSNR asks for one, else a goal."""
+    share = "30%" if quality is not None and quality.psnr < 27.0 else "3%" if quality and quality.psnr > 35.0 else None
+    other = (
+        ["--for", "web"] if share is None else ["--keep", share, "-o", str(options.output_beside(scene, share[:-1]))]
+    )
+    commands = ["pointsplat", "view", str(scene), str(output)], ["pointsplat", "compact", str(scene), *other]
+    print("next: " + "\n      ".join(map(shlex.join, commands)))

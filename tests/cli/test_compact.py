@@ -13,7 +13,7 @@ from refusing import refusal, run
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from html_parts import parts_of
 from making import ball, run_of, same
-from pointsplat_ns.cli.goals import GOALS
+from pointsplat_ns.cli.compact import GOALS
 from pointsplat_ns.compression import pictures, quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
