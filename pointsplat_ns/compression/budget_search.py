@@ -15,14 +15,11 @@ from typing import Generic, TypeVar
 
 import torch
 
-from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
 from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
-from pointsplat_ns.pruning.sh_bands import cut_sh
 from pointsplat_ns.system.progress import silent
-from pointsplat_ns.views import Views
 
 SLOPE = 6.0
 """Usual gain of merged scenes for each e-fold of the count, dB."""
@@ -255,14 +252,3 @@ def few_psnr(psnr: float, kept: float) -> float:
     cost more: at the best division of bytes, its error is a share of A kept^-p, which few Gaussians have.
     """
     return psnr + 10 * math.log10(1 - kept ** (SLOPE * math.log(10) / 10)) if kept < 1 else psnr
-
-
-def needed_sh_degree(dense: Gaussians, views: Views, psnr: float = 40.0) -> tuple[int, float]:
-    """The lowest SH degree whose renders reach ``psnr`` (dB) against those of the whole scene, and the PSNR reached. An
-    independent error of 40 dB lowers the PSNR of an ``auto`` budget of 35 dB by 1.2 dB."""
-    reference = DenseReference(dense, views)
-    for degree in range(dense.sh_degree):
-        overall, _ = reference.psnr(cut_sh(dense, degree))
-        if overall >= psnr:
-            return degree, overall
-    return dense.sh_degree, math.inf

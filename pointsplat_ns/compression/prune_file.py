@@ -110,9 +110,7 @@ def prune_file(
         request: options of pruning.
         memory: bytes that may be taken; more than the largest cell takes change nothing.
         poses: a file of cameras; by default views are sampled.
-        resolution: width and height of views, pixels.
-        up: which way is up, for sampled views; by default what the scene declares, or estimated.
-        progress: called with what is being done, and the share done of it.
+        resolution, up: as of :class:`~pointsplat_ns.looking.view_source.ViewSource`.
         jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:

@@ -22,9 +22,6 @@ from pointsplat_ns.pruning import (
 if TYPE_CHECKING:
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 
-SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
-"""Values of the option ``sh``."""
-
 Effort = Literal["instant", "quick", "thorough"]
 
 STEPS: dict[Effort, int] = {"instant": 0, "quick": 192, "thorough": 1200}
@@ -138,7 +135,7 @@ class PruneRequest:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "method", method_named(self.by, self.opacity_weight))
-        if self.sh not in SH_CHOICES:
+        if self.sh not in ("all", "auto", "0", "1", "2", "3"):
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
         budget = parse_keep(self.keep, self.suffix) if isinstance(self.keep, str) else self.keep
         object.__setattr__(self, "budget", budget)
