@@ -16,6 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views, spread_indices
@@ -130,8 +131,6 @@ def clean_source(
     """Read a scene and clean it, as :func:`clean`; results are those of :func:`prune_source`."""
     from pointsplat_ns.compression.cleaning import clean_scene
     from pointsplat_ns.compression.pictures import plot_cleaning
-    from pointsplat_ns.looking.view_source import VIEW_COUNTS
-    from pointsplat_ns.pruning import need_usable
 
     if not 0 <= strength <= 1:
         raise PointSplatError(f"strength {strength!r}: expected a number in [0, 1]")

@@ -12,20 +12,11 @@ from urllib.parse import quote
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.printing import (
-    end_if_interrupted,
-    print_if_larger,
-    print_json,
-    print_result,
-    scene_result,
-    written_size,
-)
+from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result, written_size
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.folders import SceneResult
-    from pointsplat_ns.gaussians import Gaussians
 
 GoalName = Literal["web", "phone", "headset", "email"]
 
@@ -170,7 +161,13 @@ def compact(
     files = [_file_text(scene), _file_text(output)]
     shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
     if html is not None:
-        _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
+        names = None if alone else [f"dense ({files[0]})", f"compact ({files[1]})"]
+        notes = [] if alone or quality is None else [f"{quality}"]
+        sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
+        ps.write_page(
+            [dense, result.scene][alone:], html, names, title=name_of(scene), notes=notes,
+            views=None if sampled else result.views, up=up, limit_mb=chosen.page_mb, progress=True,
+        )  # fmt: skip
     if json_output:
         made = {
             "refined": result.accepted,
@@ -180,18 +177,19 @@ def compact(
             "html": html,
         }
         print_json({**scene_result(len(dense), result.scene, result.seconds, output), **made})
-        return end_if_interrupted(result.interrupted)
-    also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
-    also += ["trained on photos"] * (result.last.photos is not None)
-    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, output, quality)
-    print_if_larger(scene, output)
-    if verbose and quality is not None:
-        print(quality.details)
-    if shown is not None:
-        print(shown)
-    _print_use(goal, html, name_of(scene), quality)
-    end_if_interrupted(result.interrupted)
-    if unasked:
+    else:
+        also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
+        also += ["trained on photos"] * (result.last.photos is not None)
+        print_result(request.prune.by, also, len(dense), result.scene, result.seconds, output, quality)
+        print_if_larger(scene, output)
+        if verbose and quality is not None:
+            print(quality.details)
+        if shown is not None:
+            print(shown)
+        _print_use(goal, html, name_of(scene), quality)
+    if result.interrupted:
+        raise KeyboardInterrupt  # once the best result so far is written and printed
+    if unasked and not json_output:
         _print_next(scene, output, quality)
 
 
@@ -228,30 +226,6 @@ def _file_text(path: Path) -> str:
 
     file = path / SOG_META if path.is_dir() else path
     return f"{path.name}, {written_size(file)}" if file.is_file() and file.suffix != ".yml" else name_of(path)
-
-
-def _write_page(
-    scene: Path,
-    shown: list[Gaussians],
-    result: Compacted,
-    files: list[str],
-    html: Path,
-    up: str | None,
-    quality: Quality | None,
-    limit_mb: float,
-) -> None:
-    """The page to fly through the result alone, or the scene before and after."""
-    import pointsplat_ns as ps
-    from pointsplat_ns.io.runs import name_of
-
-    both = len(shown) > 1
-    names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)] if both else None
-    notes = [f"{quality}"] if both and quality is not None else []
-    sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
-    ps.write_page(
-        shown, html, names, title=name_of(scene), notes=notes, views=None if sampled else result.views, up=up,
-        limit_mb=limit_mb, progress=True,
-    )  # fmt: skip
 
 
 def _print_use(goal: GoalName | None, page: Path | None, name: str, quality: Quality | None) -> None:

@@ -42,12 +42,6 @@ def print_json(content: Any) -> None:
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
 
-def end_if_interrupted(interrupted: bool) -> None:
-    """End a command that Ctrl-C interrupted as Ctrl-C does, once the best result so far is written and printed."""
-    if interrupted:
-        raise KeyboardInterrupt
-
-
 def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path) -> dict[str, Any]:
     """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one."""
     return {

@@ -34,11 +34,8 @@ def write_stream(
 
     Args:
         folder: created if it is missing.
-        levels: the finest first.
-        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
-            that are too faint to be drawn, which are left out.
+        levels, parents, progress: as of :func:`~pointsplat_ns.levels.tiles.write_tiles`.
         force: whether an existing stream may be overwritten.
-        progress: called while encoding.
 
     Returns:
         The number of Gaussians written of each level.
@@ -49,8 +46,7 @@ def write_stream(
     folder = Path(folder)
     check_folder(folder, (STREAM_META,), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
-    if scenes:
-        warn_of_losses(format_to_write(".sog"), scenes[0], folder)
+    warn_of_losses(format_to_write(".sog"), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
     return write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]

@@ -31,9 +31,6 @@ from pointsplat_ns.system.tensors import DOUBLES
 TILESET = "tileset.json"
 """The file that tells of all others."""
 
-PIXELS = 16.0
-"""Pixels of error at which CesiumJS refines a tile, unless it is told another number."""
-
 
 def placed(
     levels: Sequence[Gaussians], dense: Gaussians, at: str | None, up: str | None
@@ -98,7 +95,8 @@ def write_tiles(
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
     count = sum(1 for top in tops for _ in _all(top))
-    errors = [PIXELS * size for size in itertools.accumulate(pixel_sizes, max)]
+    # CesiumJS refines a tile at an error of 16 pixels, unless it is told another number
+    errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
     counts, number = [0] * len(levels), itertools.count()
 
     def tile(cell: Cell) -> dict[str, Any]:
