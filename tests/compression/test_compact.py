@@ -193,7 +193,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
     assert same(result.scene, pruned) and result.repaired.after.psnr > result.before.psnr + 3
-    assert closer_in(result.before, result.after) == 1
+    assert closer_in(result.before, result.repaired.after) == 1
     assert result.verdict.startswith("not refined by the network, it is farther in most views: ")
     assert "not repaired by 5 steps in 0.5 s, it is farther in most views: " in result.verdict
 

@@ -103,16 +103,12 @@ def test_what_cannot_be_reached_or_means_nothing_is_refused(dense, options, said
 
 
 def test_scenes_of_a_folder_each_reach_it(tmp_path, dense, views):
-    for name, scene in (("a", dense), ("b", box_room(1, 300))):
-        ps.save(scene, tmp_path / "rooms" / f"{name}.ply")
-    results = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0)
-    assert [result.status for result in results] == ["done", "done"]
-    for result in results:
-        assert mean_psnr(ps.load(Path(result.output)), ps.load(result.source), views) >= 24
-        assert result.after < result.before
-    again = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0)
-    assert [replace(result, seconds=0) for result in again] == [
-        replace(result, status="done before", seconds=0) for result in results
+    ps.save(dense, tmp_path / "rooms" / "a.ply")
+    [result] = ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0)
+    assert result.status == "done" and result.after < result.before
+    assert mean_psnr(ps.load(Path(result.output)), dense, views) >= 24
+    assert ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=24.0) == [
+        replace(result, status="done before")
     ]
     with pytest.raises(PointSplatError, match="holds results of other options"):
         ps.compact_folder(tmp_path / "rooms", by="opacity", target_db=25.0)
