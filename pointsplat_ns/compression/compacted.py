@@ -42,6 +42,11 @@ class Stage:
         """Whether the stage is kept."""
         return not self.reason
 
+    @property
+    def done(self) -> str:
+        """What the stage does to a scene, as a participle."""
+        return {"merge": "merged", "photos": "trained"}.get(self.name, f"{self.name.removesuffix('e')}ed")
+
 
 @dataclass(frozen=True, eq=False)
 class Compacted:
@@ -149,14 +154,14 @@ def last_kept(stages: Sequence[Stage]) -> Stage:
 def _line(stage: Stage) -> str:
     cost = f" by {counted(stage.steps, 'step')} in {stage.seconds:.1f} s" if stage.name in ("repair", "photos") else ""
     cost += ", interrupted" if stage.interrupted else ""
-    done = {"refine": "refined by the network", "repair": "repaired", "round": "rounded for the size of the file"}
+    done = stage.done + {"refine": " by the network", "round": " for the size of the file"}.get(stage.name, "")
     if stage.photos is not None:
-        done["photos"] = f"trained on {stage.photos.used} photos"
+        done += f" on {stage.photos.used} photos"
         figures = f"{stage.photos.before:.1f} -> {stage.photos.after:.1f} dB PSNR in {stage.photos.compared} photos"
     else:
         figures = "" if stage.before is None or stage.after is None else _figures(stage.before, stage.after)
     reason = f", {stage.reason}" if stage.reason and figures else stage.reason and f": {stage.reason}"
-    return f"{'' if stage.accepted else 'not '}{done[stage.name]}{cost}{reason}" + (f": {figures}" if figures else "")
+    return f"{'' if stage.accepted else 'not '}{done}{cost}{reason}" + (f": {figures}" if figures else "")
 
 
 def _figures(before: Closeness, after: Closeness) -> str:

@@ -62,15 +62,7 @@ def plot_comparison(
     names, titles, scenes = ["dense"], [_title("dense", dense, files[0])], []
     for stage in result.stages:
         if stage.after is not None:
-            name = {
-                "merge": "merged",
-                "prune": "pruned",
-                "refine": "refined",
-                "repair": "repaired",
-                "photos": "trained",
-                "round": "rounded",
-            }[stage.name]
-            names.append(name if stage.accepted else f"{name} (left out)")
+            names.append(stage.done if stage.accepted else f"{stage.done} (left out)")
             last = stage is result.last
             said = [files[1], "" if quality is None else re.sub("[:;] ", "\n", str(quality))] if last else []
             titles.append(_title(names[-1], stage.scene, *said))
