@@ -45,7 +45,7 @@ class Stage:
     @property
     def done(self) -> str:
         """What the stage does to a scene, as a participle."""
-        return {"merge": "merged", "photos": "trained"}.get(self.name, f"{self.name.removesuffix('e')}ed")
+        return "trained" if self.name == "photos" else f"{self.name.removesuffix('e')}ed"
 
 
 @dataclass(frozen=True, eq=False)
