@@ -199,17 +199,15 @@ def clean_scene(
         rules.append((dropped.floating, dropped.indices, f"that float before what {len(floating)} views show, {found}"))
     notes = []
     for gone, so_far, what in rules if len(dropped.undrawable) else rules[1:]:
-        close = "" if reference is None or len(gone) == 0 else _closeness(reference, _without(dense, so_far))
+        close = ""
+        if reference is not None and len(gone):
+            psnr, worst = reference.psnr(_without(dense, so_far))
+            seen = views_text(len(reference.views))
+            close = f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {seen}"
+            if math.isinf(psnr):
+                close = f"; renders of {seen} stay the same"
         notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}{close}")
     return Cleaning(junk, len(dense), tuple(notes))
-
-
-def _closeness(reference: DenseReference, scene: Gaussians) -> str:
-    psnr, worst = reference.psnr(scene)
-    views = views_text(len(reference.views))
-    if math.isinf(psnr):
-        return f"; renders of {views} stay the same"
-    return f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:

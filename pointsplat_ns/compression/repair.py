@@ -74,7 +74,10 @@ def repair(
     def choose(scene: Gaussians) -> tuple[float, Tensor | None]:
         factors = None
         if network is not None:
-            expected = budget.steps_in_all(run.count, run.done) or REPAIR.most_steps
+            if budget.seconds is None:
+                expected = budget.steps
+            else:
+                expected = round(run.count / run.done) if run.done else REPAIR.most_steps
             with torch.no_grad(), one_thread():  # the same rounding for any number of threads
                 factors = network(feedback.features(scene, run.done, expected))
         return first_factor * rate_factor(run.done), factors

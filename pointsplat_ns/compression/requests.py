@@ -83,13 +83,6 @@ class RepairBudget:
         not be empty."""
         return seconds / self.seconds if self.seconds is not None else steps / self.steps
 
-    def steps_in_all(self, steps: int, done: float) -> int | None:
-        """Expected number of steps in the budget, if ``steps`` steps used the share ``done`` of it; None before the
-        first step of a budget in seconds."""
-        if self.seconds is None:
-            return self.steps
-        return round(steps / done) if done else None
-
 
 @dataclass(frozen=True)
 class PhotoBudget(RepairBudget):
