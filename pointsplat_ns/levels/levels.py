@@ -135,18 +135,6 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        write_levels(folder, self.scenes, *self._manifest(), force)
-
-    def pixel_sizes(self) -> list[float]:
-        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
-        Gaussians."""
-        near, found = [level.quality.psnr for level in self if level.quality is not None], None
-        if self.views is not None:
-            found = pixel_sizes(self.dense, DenseReference(self.dense, self.views), self.scenes, near)
-        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
-
-    def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """The manifest's facts on all levels together, and on each."""
         dense, file, of = self.dense, self.source, self.views
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
         if bool((dense.alphas > 0).any()):
@@ -162,7 +150,16 @@ class Levels:
             "sh_degree": dense.sh_degree,
         }
         bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
-        return {"source": source, "bounds": bounds, "views": views}, [level.facts(len(dense)) for level in self]
+        about = {"source": source, "bounds": bounds, "views": views}
+        write_levels(folder, self.scenes, about, [level.facts(len(dense)) for level in self], force)
+
+    def pixel_sizes(self) -> list[float]:
+        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
+        Gaussians."""
+        near, found = [level.quality.psnr for level in self if level.quality is not None], None
+        if self.views is not None:
+            found = pixel_sizes(self.dense, DenseReference(self.dense, self.views), self.scenes, near)
+        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -94,14 +94,13 @@ def write_tiles(
     check_folder(folder, (TILESET,), force)
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
-    count = sum(1 for top in tops for _ in _all(top))
     # CesiumJS refines a tile at an error of 16 pixels, unless it is told another number
     errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
     counts, number = [0] * len(levels), itertools.count()
 
     def tile(cell: Cell) -> dict[str, Any]:
         scene, index = levels[cell.level][cell.rows], next(number)
-        progress(f"tile {index + 1} of {count}", index / count)
+        progress("writing tiles", sum(counts) / sum(map(len, levels)))
         low, high = _box(scene)
         x, y, z = (0.5 * (low + high)).tolist()
         name = f"tiles/{cell.level}_{index}.glb"
@@ -127,12 +126,6 @@ def write_tiles(
         part.write_text(json.dumps(tileset, separators=(",", ":")), "utf-8")
         (folder / TILESET).unlink(missing_ok=True)
     return counts
-
-
-def _all(cell: Cell) -> Iterator[Cell]:
-    yield cell
-    for child in cell.children:
-        yield from _all(child)
 
 
 def _box(scene: Gaussians) -> tuple[Tensor, Tensor]:
