@@ -85,7 +85,13 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise WeightsError(f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file")
     if kind == ".safetensors":
-        network, settings = read_refiner(path), _settings_of_file(path)
+        network, metadata = read_refiner(path), read_metadata(path)
+        try:
+            settings = settings_from({"keep": 0.1, "by": "merge", **metadata})
+        except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
+            raise WeightsError(
+                f"{path}: metadata not understood ({one_line(error)}); train or download it again"
+            ) from error
     elif path.is_file() and kind not in (".yml", ".yaml", ".ckpt"):
         raise WeightsError(
             f"{path}: a {kind or 'nameless'} file; expected a trained pointsplat run (its folder or config.yml), or a "
@@ -187,14 +193,3 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
         text = " ".join(str(error).split())[:160]
         raise SceneError(f"{run.checkpoint}: not a usable {METHOD_NAMES.refiner} checkpoint ({text})") from error
     return network, settings
-
-
-def _settings_of_file(path: Path) -> PruneSettings:
-    """Pruning settings from the metadata of a file of weights."""
-    metadata = read_metadata(path)
-    try:
-        return settings_from({"keep": 0.1, "by": "merge", **metadata})
-    except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WeightsError(
-            f"{path}: metadata not understood ({one_line(error)}); train or download it again"
-        ) from error
