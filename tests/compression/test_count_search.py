@@ -79,6 +79,18 @@ def test_tries_are_limited_once_one_meets_the_target():
     assert found is not None and len(tried) > 2
 
 
+def test_ctrl_c_gives_the_best_so_far_only_where_that_is_wanted():
+    def measure(count):
+        if count < MOST:
+            raise KeyboardInterrupt
+        return 1.0, count
+
+    with pytest.raises(KeyboardInterrupt):
+        find_count(measure, 0.5, True, MOST, MOST, 1.0, 0.1)
+    found = find_count(measure, 0.5, True, MOST, MOST, 1.0, 0.1, stoppable=True)
+    assert found.best == MOST and found.interrupted
+
+
 def test_bounds_are_tried_before_it_gives_up():
     found, tried = searched(MEASURES["bent"], 41.0, True)
     assert found is None and MOST in tried
