@@ -83,7 +83,9 @@ def prune(
         processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
         with progress_bar() as report:
             before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report, processes)
-        small, quality = PlyRows.open(output), None
+        written, quality = PlyRows.open(output), None
+        assert written is not None
+        small = written
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(before, small, seconds, output), **compared})
