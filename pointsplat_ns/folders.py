@@ -26,7 +26,7 @@ from pointsplat_ns.comparing.sizes import parse_resolution, size_text
 from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
 from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
-from pointsplat_ns.compression.trained_refiner import refiner_at
+from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
@@ -127,7 +127,7 @@ def compact_folder(
             by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
             file, or is a PLY where that cannot be written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
-        refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
+        refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
         by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each scene.
         data: folder above the data of the runs. A run whose data is not found gets sampled views, and a note.
         target_format: suffix of all results, such as ".sog"; by default each result has the format of its scene.
@@ -156,7 +156,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    size, trained = parse_resolution(resolution), _loaded(refiner)
+    size, trained = parse_resolution(resolution), None if refiner is None else _loaded(refiner)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db)
     options: dict[str, str | float | bool | None] = {
         "keep": str(request.prune.budget), "by": request.prune.by, "sh": sh, "clean": clean, "effort": effort,
@@ -208,7 +208,7 @@ def output_folder(folder: Path) -> Path:
     return place.with_name(f"{place.name}_compact")
 
 
-_loaded = functools.cache(refiner_at)
+_loaded = functools.cache(load_refiner)  # once in each process
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,8 @@ class _Compacting:
         dense, kind = read_scene(task.source), format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
         prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
-        request = dataclasses.replace(self.request, prune=prune, refiner=_loaded(self.refiner))
+        trained = None if self.refiner is None else _loaded(self.refiner)
+        request = dataclasses.replace(self.request, prune=prune, refiner=trained)
         made = (compact_scene if request.target_db is None else compact_to_psnr)(dense, request, source)
         if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene

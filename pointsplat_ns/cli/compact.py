@@ -137,7 +137,6 @@ def compact(
     from pointsplat_ns.compacting import Looking, compact_source
     from pointsplat_ns.compression.quality import judge_of, quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
-    from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.runs import name_of
 
@@ -151,7 +150,8 @@ def compact(
     html = output.with_suffix(".html") if alone else html
     options.check_outputs(output, force, picture, html)
     budget, suffix = RepairBudget(effort, seconds), format_to_write(output).suffix
-    request = CompactRequest.of(refiner_at(refiner), keep, by, sh, clean, budget, bool(photos), suffix, target_db)
+    trained = None if refiner is None else ps.load_refiner(refiner)
+    request = CompactRequest.of(trained, keep, by, sh, clean, budget, bool(photos), suffix, target_db)
     looking = Looking(poses, resolution, up, data, photos)
     dense, result, source = compact_source(scene, request, looking, progress=True)
     ps.save(result.scene, output, progress=True, overwrite=True)

@@ -178,17 +178,15 @@ def smallest_within(
     Args:
         n: number of Gaussians of the dense scene.
         measure: from a count, at most n, to the PSNR of a scene against the dense one, dB, and what was made.
-        psnr: to be reached, dB.
+        psnr: to be reached, dB, above 0.
         stoppable: as for :func:`find_count`.
 
     Returns:
         What was made with the best count, and the search.
 
     Raises:
-        BudgetError: if ``psnr`` is not a positive number, or not even n Gaussians reach it.
+        BudgetError: if not even n Gaussians reach it.
     """
-    if not 0 < psnr < math.inf:
-        raise BudgetError(f"the wanted PSNR is {psnr} dB; expected a positive number, such as 35")
     first = max(1, round(0.3 * n))
     found = find_count(measure, psnr, True, first, n, SLOPE, tolerance=0.1, stoppable=stoppable)
     if found.best is None:

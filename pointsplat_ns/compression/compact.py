@@ -17,7 +17,7 @@ from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget, default_device
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -53,7 +53,7 @@ def compact_scene(
     request.check_sh_degree(dense)
     views = views or ViewSource(dense)
     pruned = prune_scene(dense, request.prune, views, progress, rounding=False)
-    at_work = dense.to(request.device)
+    at_work = dense.to(default_device() if request.refiner is None else request.refiner.device)
     judge, reference, uncompared = None, None, ""
     try:
         progress("comparing renders", 0.0)

@@ -13,6 +13,7 @@ from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.pruning import (
     Keep,
     Method,
+    PruneSettings,
     found_by_trying,
     method_named,
     parse_keep,
@@ -176,21 +177,14 @@ class CompactRequest:
         if target_db is not None and (photos or keep is not None):
             other = "photos, which may differ from renders" if photos else "a budget"
             raise BudgetError(f"--target-db finds a size by renders of the dense scene; expected it without {other}")
-        usual_keep, usual_by, weight = 0.1, "merge", None
-        if refiner is not None:
-            usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
-        by = usual_by if by is None else by
-        weight = weight if method_named(by).weighs_opacity else None
-        prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean, suffix)
+        usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
+        by = usual.by if by is None else by
+        weight = usual.opacity_weight if method_named(by).weighs_opacity else None
+        prune = PruneRequest(usual.keep if keep is None else keep, by, sh, weight, clean, suffix)
         if not photos:
             return cls(prune, refiner, repair, target_db=target_db)
         trained = PhotoBudget(repair.effort, repair.seconds)
         return cls(prune, refiner, repair if repair.seconds is None else RepairBudget(), trained)
-
-    @property
-    def device(self) -> torch.device:
-        """The device that renders: the refiner's, or the default one."""
-        return default_device() if self.refiner is None else self.refiner.device
 
     def check_sh_degree(self, dense: Gaussians) -> None:
         """Raise a SceneError, before the long computations, if the SH degree after pruning is certain to exceed the

@@ -61,7 +61,7 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
 
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or checkpoint); by default
-            the shipped refiner (``pointsplat_ns/refiner/pretrained/CARD.md`` describes its training).
+            or for "shipped" the one that ships (``pointsplat_ns/refiner/pretrained/CARD.md`` describes its training).
         device: device of the network; by default CUDA if available, else the CPU.
 
     Raises:
@@ -75,12 +75,13 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
         500
     """
     device = default_device() if device is None else device
-    if path is None and not SHIPPED_REFINER.is_file():
+    shipped = path is None or str(path) == "shipped"
+    if shipped and not SHIPPED_REFINER.is_file():
         raise WeightsError(
             f"{SHIPPED_REFINER}: the refiner that ships is not there; install the package again, or name another "
             "(--refiner RUN_OR_FILE)"
         )
-    path = SHIPPED_REFINER if path is None else Path(path)
+    path = SHIPPED_REFINER if path is None or shipped else Path(path)
     kind = path.suffix.lower()
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise WeightsError(f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file")
@@ -125,13 +126,6 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
         True
     """
     return (refiner or load_refiner())(scene)
-
-
-def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
-    """The trained refiner at a path as for :func:`load_refiner`, or the one that ships for "shipped"; None for None."""
-    if path is None:
-        return None
-    return load_refiner(None if str(path) == "shipped" else path, device)
 
 
 def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:

@@ -128,7 +128,7 @@ def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
         smallest_within(len(hollow_ball), lambda k: (reference.psnr(cut_sh(hollow_ball, 0)[:k])[0], k), 60.0)
     for wanted in (0.0, -3.0, math.nan, math.inf):
         with pytest.raises(BudgetError, match="expected a positive number"):
-            smallest_within(len(hollow_ball), lambda k: (0.0, k), wanted)
+            WithinPsnr(wanted)
 
 
 def search(full, limit, encode=encode_spz):
