@@ -130,9 +130,9 @@ class OptimisationRun:
 
 def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:
     """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end. A view that comes
-    again is not drawn again, as long as it is among the last ``REPAIR.pictures_kept``."""
+    again is not drawn again, as long as it is among the last 256."""
 
-    @functools.lru_cache(maxsize=REPAIR.pictures_kept)
+    @functools.lru_cache(maxsize=256)  # of 0.7 MB each where pictures are 16 to 9
     def drawn(view: View) -> Tensor:
         with torch.no_grad():
             return render(dense, view)
