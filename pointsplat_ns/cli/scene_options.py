@@ -147,14 +147,6 @@ def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec
     )
 
 
-def _share(text: str) -> float:
-    return parse_number(text[:-1]) / 100 if text.endswith("%") else parse_number(text)
-
-
-Share = Annotated[float, _spec("SHARE", _share)]
-"""A share of the Gaussians, such as 0.1 or 10%."""
-
-
 def _photos(words: list[str]) -> Path | bool:
     if len(words) > 1 or words == [""]:
         raise ValueError("expected a folder of photos, or nothing for those of a run")
