@@ -208,9 +208,9 @@ class LevelOutput:
         elif self.form == "tiles":
             about, matrix = placed(levels.scenes, levels.dense, self.at, self.up)
             parents = [of.cpu() for of in levels.parents]
-            write_tiles(self.path, about, parents, levels.pixel_sizes(), matrix, self.force, progress)
+            write_tiles(self.path, about, parents, levels.pixel_sizes(), matrix, progress)
         else:
-            write_stream(self.path, levels.scenes, levels.parents, self.force, progress)
+            write_stream(self.path, levels.scenes, levels.parents, progress)
             if levels.judge is not None:
                 read = [levels.judge.quality(read_sog_stream(self.path, index)) for index in range(len(levels))]
                 judged = (replace(level, quality=quality) for level, quality in zip(levels, read, strict=True))

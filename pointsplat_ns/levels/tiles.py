@@ -21,7 +21,6 @@ from pointsplat_ns.io.formats.glb_tile import TILE_EXTENSIONS, encode_tile
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.offsets import from_centre
 from pointsplat_ns.io.scene import warn_of_losses
-from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.levels.tree import Cell, cells
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import known_up, up_named
@@ -60,12 +59,11 @@ def placed(
 
 
 def write_tiles(
-    folder: Path | str,
+    folder: Path,
     levels: Sequence[Gaussians],
     parents: Sequence[Tensor],
     pixel_sizes: Sequence[float],
     matrix: Tensor,
-    force: bool = False,
     progress: Progress = silent,
     most: int = 1 << 16,
 ) -> list[int]:
@@ -80,7 +78,6 @@ def write_tiles(
             that are too faint to be drawn, which are left out.
         pixel_sizes: of each level, scene units a pixel from which on it shows enough.
         matrix: (4, 4) float64, from the levels' frame to that of the tiles.
-        force: whether existing tiles may be overwritten.
         progress: called while encoding.
         most: Gaussians in a tile, but for children of one parent.
 
@@ -88,10 +85,8 @@ def write_tiles(
         The number of Gaussians written of each level.
 
     Raises:
-        SceneError: if the folder cannot be used, or a file cannot be written.
+        SceneError: if a file cannot be written.
     """
-    folder = Path(folder)
-    check_folder(folder, (TILESET,), force)
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
     # CesiumJS refines a tile at an error of 16 pixels, unless it is told another number

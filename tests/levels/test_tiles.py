@@ -163,10 +163,10 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
     write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(ps.SceneError, match=r"tileset\.json: exists already"):
-        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
+        LevelOutput(tmp_path / "a", "tiles", None, None, force=False).check(2)
     monkeypatch.setattr("pointsplat_ns.levels.tiles.encode_tile", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double(), force=True)
+        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     ps.save(normal_scene(20), tmp_path / "room.ply")
     for options, words in (
