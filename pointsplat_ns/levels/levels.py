@@ -201,6 +201,7 @@ class LevelOutput:
 
     def write(self, levels: Levels, progress: Progress) -> Levels:
         """Write levels; those of a stream are then judged as they are in its files."""
+        self.check(len(levels))  # again: a file may have appeared meanwhile
         if self.form == "folder":
             levels.save(self.path, self.force)
         elif self.form == "paged":
