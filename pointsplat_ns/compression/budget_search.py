@@ -1,4 +1,4 @@
-"""One search for all budgets without a formula: PSNR of renders, size of a compressed file, time of a frame.
+"""One search for all budgets without a formula: PSNR of renders, and size of a compressed file.
 
 Each measure rises with the number of Gaussians, nearly linearly in the logarithm of the number. So the next count is
 interpolated between a count below the target and one above it. As long as all tried counts lie on one side, it is

@@ -15,11 +15,11 @@ from refusing import refusal, run
 
 import pointsplat_ns as ps
 from killing import KILLED_AFTER_STEPS
-from making import ball, normal_scene, quick_start, run_of, same
+from making import ball, normal_scene, quick_start, run_of
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.pruning import METHODS
 from posing import inria, written
 
 SEED = 5
@@ -34,14 +34,6 @@ def ply(tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
     return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
-
-
-def test_prune_scores_as_it_is_told(ply, tmp_path):
-    run("prune", ply, "--keep", "9", "--by", "authors", "-o", tmp_path / "authors.ply")
-    run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
-    dense = read_ply(ply)
-    assert same(read_ply(tmp_path / "authors.ply"), prune(dense, 9, "authors"))
-    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity"))
 
 
 def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
