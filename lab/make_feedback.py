@@ -10,13 +10,14 @@ import math
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 
 import pointsplat_ns as ps
 from lab.common.printing import start as start_program
 from lab.feedback_training import TrainingScene, train_feedback
 from pointsplat_ns.refiner.feedback import read_feedback_refiner
-from pointsplat_ns.system.processes import connect_torchrun, torchrun_device, torchrun_rank
+from pointsplat_ns.system.processes import connect_torchrun, local_rank, torchrun_rank
 from pointsplat_ns.system.progress import progress_bar, tracked
 from pointsplat_ns.system.threads import fixed_threads
 
@@ -56,7 +57,8 @@ def main(
         raise ps.DataError(f"--updates {updates}: expected at least 1")
     known = None if start is None else read_feedback_refiner(start)
     connect_torchrun()
-    device, first, ready = torchrun_device(), torchrun_rank()[0] == 0, []
+    count, first, ready = torch.cuda.device_count(), torchrun_rank()[0] == 0, []
+    device = torch.device("cuda", local_rank() % count) if count else torch.device("cpu")
     with fixed_threads(threads):
         for path in tracked(scenes, "merging scenes", len(scenes), first):
             ready.append(TrainingScene.of(path.stem, ps.load(path).to(device), keep))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pointsplat_ns.api import compact, example_room, load, lod, plot_views, prune
     from pointsplat_ns.compacting import clean
     from pointsplat_ns.compression.compacted import Compacted
-    from pointsplat_ns.compression.pictures import plot_comparison, plot_distributions
+    from pointsplat_ns.compression.pictures import plot_comparison
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner, load_refiner, refine
     from pointsplat_ns.errors import BudgetError, DataError, MissingPackageError, PointSplatError, SceneError
     from pointsplat_ns.filming import open_viewer, render_path
@@ -51,7 +51,7 @@ _PUBLIC = {
     "pointsplat_ns.compacting": ("clean",),
     "pointsplat_ns.compression.compacted": ("Compacted",),
     "pointsplat_ns.levels.levels": ("Levels",),
-    "pointsplat_ns.compression.pictures": ("plot_comparison", "plot_distributions"),
+    "pointsplat_ns.compression.pictures": ("plot_comparison",),
     "pointsplat_ns.placing": ("place",),
     "pointsplat_ns.scene_info": ("SceneInfo", "info"),
     "pointsplat_ns.compression.trained_refiner": ("TrainedRefiner", "load_refiner", "refine"),
@@ -78,7 +78,7 @@ __all__ = [
     "BudgetError", "Compacted", "DataError", "Gaussians", "Levels", "MissingPackageError", "PointSplatError",
     "SceneError", "SceneInfo", "SceneResult", "Tradeoff", "TrainedRefiner", "View", "Views", "clean", "compact",
     "compact_folder", "dataset_views", "example_room", "info", "load", "load_refiner", "lod", "lpips",
-    "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_distributions", "plot_views", "prune",
+    "measure_tradeoff", "open_viewer", "place", "plot_comparison", "plot_views", "prune",
     "psnr", "rasterization", "refine", "render", "render_path", "sample_views", "save", "ssim", "write_page",
 ]  # fmt: skip
 

@@ -24,8 +24,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.runs import may_be_run, open_run
 from pointsplat_ns.io.scene import read_scene, source_file
-from pointsplat_ns.levels.levels import DEFAULT_LEVELS, Levels, make_levels, parse_levels
-from pointsplat_ns.levels.writing import LevelOutput
+from pointsplat_ns.levels.levels import LevelOutput, Levels, make_levels, parse_levels
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
@@ -220,7 +219,7 @@ def compact(
 @normal_mode
 def lod(
     scene: Source,
-    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
+    levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),
     *,
     sh: str = "all",
     views: Views | str | Path | None = None,
@@ -246,9 +245,11 @@ def lod(
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
         folder: output folder for the levels and a manifest; see :meth:`Levels.save`. A name that ends in
-            .rad is a file of all levels; see :meth:`Levels.save_paged`.
-        stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
-        tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
+            .rad is a file of all levels for Spark.
+        stream: write a streamed SOG instead.
+        tiles: write 3D Tiles instead.
+        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates ("EPSG:32632"), or the latitude,
+            longitude and height of its origin ("48.86,2.29,35"); by default they have the frame of the scene's file.
         force: overwrite existing files in ``folder``.
 
     Returns:
@@ -268,14 +269,14 @@ def lod(
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
-    PruneRequest(1.0, sh=sh)
+    request = PruneRequest(1.0, sh=sh)
     output = LevelOutput.of(folder, stream, tiles, at, up, force)
     if output is not None:
         output.check(len(budgets))
     dense, view_source = read_source(scene, Looking(views, resolution, up, data))
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
-        made = make_levels(dense, levels, sh, view_source, source, report)
+        made = make_levels(dense, budgets, request, view_source, source, report)
         made = made if output is None else output.write(made, report)
     log(made.notes)
     return made

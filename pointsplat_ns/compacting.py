@@ -16,6 +16,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.upright import Up, up_named
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
+from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.views import Views, spread_indices
@@ -130,8 +131,6 @@ def clean_source(
     """Read a scene and clean it, as :func:`clean`; results are those of :func:`prune_source`."""
     from pointsplat_ns.compression.cleaning import clean_scene
     from pointsplat_ns.compression.pictures import plot_cleaning
-    from pointsplat_ns.looking.view_source import VIEW_COUNTS
-    from pointsplat_ns.pruning import need_usable
 
     if not 0 <= strength <= 1:
         raise PointSplatError(f"strength {strength!r}: expected a number in [0, 1]")
@@ -161,15 +160,13 @@ def compact_source(
     Returns:
         The dense scene, the result, and the source of its views, to judge it in.
     """
+    from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
+
     dense, source, photos = _read_photographed(scene, looking, progress)
     with progress_bar(progress) as report:
         if request.target_db is None:
-            from pointsplat_ns.compression.compact import compact_scene
-
             result = compact_scene(dense, request, source, report, photos.training)
         else:
-            from pointsplat_ns.compression.target_search import compact_to_psnr
-
             result = compact_to_psnr(dense, request, source, report)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
     log(tuple(filter(None, [result.target])))

@@ -23,11 +23,10 @@ from typing import Any, Literal
 import torch
 
 from pointsplat_ns.comparing.sizes import parse_resolution, size_text
-from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.quality import judge_of, quality_line, read_back
-from pointsplat_ns.compression.requests import CompactRequest, Effort, PruneRequest, RepairBudget
-from pointsplat_ns.compression.target_search import compact_to_psnr
-from pointsplat_ns.compression.trained_refiner import refiner_at
+from pointsplat_ns.compression.requests import CompactRequest, Effort, RepairBudget
+from pointsplat_ns.compression.trained_refiner import load_refiner
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
@@ -128,7 +127,7 @@ def compact_folder(
             by default beside ``folder``: ``scenes_compact`` for ``scenes``. Each result has the format of its scene's
             file, or is a PLY where that cannot be written.
         keep: as for :func:`compact`; a size such as "5MB" is that of the result in its own format.
-        refiner: as for :func:`~pointsplat_ns.load_refiner`, or "shipped"; None for no refiner.
+        refiner: as for :func:`~pointsplat_ns.load_refiner`; None for no refiner.
         by, sh, clean, effort, seconds, target_db, resolution: as for :func:`compact`, for each scene.
         data: folder above the data of the runs. A run whose data is not found gets sampled views, and a note.
         target_format: suffix of all results, such as ".sog"; by default each result has the format of its scene.
@@ -157,7 +156,7 @@ def compact_folder(
     """
     folder = Path(folder)
     target = output_folder(folder) if output is None else Path(output)
-    size, trained = parse_resolution(resolution), _loaded(refiner)
+    size, trained = parse_resolution(resolution), None if refiner is None else _loaded(refiner)
     request = CompactRequest.of(trained, keep, by, sh, clean, RepairBudget(effort, seconds), target_db=target_db)
     options: dict[str, str | float | bool | None] = {
         "keep": str(request.prune.budget), "by": request.prune.by, "sh": sh, "clean": clean, "effort": effort,
@@ -179,7 +178,7 @@ def compact_folder(
     ]
     _describe(target, options, force)
     drawn = (page, sheet) != (None, None)
-    work = _Compacting(request.prune, request.repair, target_db, refiner, size, data, options, drawn, force)
+    work = _Compacting(dataclasses.replace(request, refiner=None), refiner, size, data, options, drawn, force)
     results: dict[str, SceneResult] = {}
     try:
         with progress_bar(progress) as report, Workers(work, jobs) as workers:
@@ -194,7 +193,7 @@ def compact_folder(
             if task.name not in results:  # its process may have ended while it wrote
                 for part in task.output.parent.glob(f".{glob.escape(task.output.name)}*.part"):
                     part.unlink(missing_ok=True)
-        rows = [results.get(task.name) or _known(task) for task in tasks]
+        rows = [results.get(task.name) or _known(task, _read_record(task)) for task in tasks]
         write_csv([dataclasses.asdict(row) for row in rows], target / FOLDER_FILES.scenes_table)
         if page is not None:
             write_gallery(page, folder.resolve().name, rows)
@@ -209,7 +208,7 @@ def output_folder(folder: Path) -> Path:
     return place.with_name(f"{place.name}_compact")
 
 
-_loaded = functools.cache(refiner_at)
+_loaded = functools.cache(load_refiner)  # once in each process
 
 
 @dataclass(frozen=True)
@@ -250,9 +249,7 @@ def _describe(output: Path, options: Mapping[str, Any], force: bool) -> None:
 class _Compacting:
     """Compacts a scene of a folder, unless that is done. It is pickled for other processes."""
 
-    request: PruneRequest
-    repair: RepairBudget
-    target_db: float | None
+    request: CompactRequest  # without the refiner
     refiner: str | Path | None  # loaded by each process
     resolution: tuple[int, int] | None
     data: str | Path | None
@@ -276,12 +273,11 @@ class _Compacting:
                     f"{task.output}: exists already, and was not made by an earlier call or was changed since; "
                     "name another folder, or overwrite it with --force"
                 )
-            finished = record is not None and whole and record["key"] == key
-            if not finished:
+            if record is None or not whole or record["key"] != key:
                 return self._make(task, source.bytes, key, start)
             if self.drawn and not pair_of(task.output).exists():
                 self._draw(task, read_scene(task.source), read_scene(task.output))
-            return _known(task)
+            return _known(task, record)
         except Exception as error:  # one scene must not stop the others
             kind = "" if isinstance(error, (PointSplatError, OSError)) else f"{type(error).__name__}: "
             return task.result("failed", seconds=time.perf_counter() - start, error=kind + one_line(error, limit=1000))
@@ -290,15 +286,17 @@ class _Compacting:
         """Write a result and its record. A process killed in between leaves the record alone: the scene is open."""
         dense, kind = read_scene(task.source), format_to_write(task.output)
         source = view_source(dense, run=task.source, data=self.data, resolution=self.resolution)
-        request, trained = dataclasses.replace(self.request, suffix=kind.suffix), _loaded(self.refiner)
-        whole = CompactRequest(request, trained, self.repair, target_db=self.target_db)
-        made = (compact_scene if self.target_db is None else compact_to_psnr)(dense, whole, source)
+        prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
+        trained = None if self.refiner is None else _loaded(self.refiner)
+        request = dataclasses.replace(self.request, prune=prune, refiner=trained)
+        made = (compact_scene if request.target_db is None else compact_to_psnr)(dense, request, source)
         if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         scene = made.scene
         same = scene.sh_degree == dense.sh_degree and len(scene) == len(dense)
         same = same and all(map(torch.equal, scene.tensors(), dense.tensors()))
-        judge = None if same and kind.suffix == ".ply" else judge_of(dense, source)  # nothing differs
+        differs = not same or kind.suffix != ".ply"
+        judge = (made.judge or judge_of(dense, source)) if differs else None
         with replacing(task.output) as part:
             save_as(kind, scene, part, name=task.output)
             written = read_back(scene, part, kind)
@@ -338,9 +336,8 @@ def _read_record(task: _Task) -> dict[str, Any] | None:
     return record if texts and numbers else None
 
 
-def _known(task: _Task) -> SceneResult:
-    """The result in a record."""
-    record = _read_record(task)
+def _known(task: _Task, record: dict[str, Any] | None) -> SceneResult:
+    """The result in a record; an open one without."""
     if record is None:
         return task.result("open")
     return task.result("done before", **{name: record[name] for name in (*FIGURES, "note")})

@@ -26,7 +26,6 @@ from lab.tables.layout import write_tables
 from lab.tables.making import Maker, Refiners, Tools
 from lab.tables.scenes import OpenedScene, Options, open_scene, paper_dataset
 from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
-from pointsplat_ns.cli.scene_options import Share
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
@@ -104,7 +103,7 @@ def measure_tables(
     scenes: tyro.conf.Positional[tuple[Path, ...]],
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     *,
-    keeps: tuple[Share, ...] = PROTOCOL.shares,
+    keeps: tuple[float, ...] = PROTOCOL.shares,
     refiners: tuple[Path, ...] = (),
     groups: tuple[str, ...] = (),
     only: tuple[str, ...] = (),

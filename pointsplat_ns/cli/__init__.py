@@ -20,7 +20,7 @@ from typing import Any, NoReturn, TextIO, cast
 
 from pointsplat_ns.errors import PointSplatError, printable
 
-COMMANDS = (*("prune", "compact", "clean", "lod", "tradeoff", "convert", "info", "view", "render", "export", "demo"),)
+COMMANDS = ("prune", "compact", "clean", "lod", "tradeoff", "convert", "info", "view", "render", "export", "demo")
 """The commands. Each is a function in a module of the same name, which is imported when the command runs."""
 
 
@@ -66,11 +66,6 @@ def any_text_printable() -> Iterator[None]:
             out.reconfigure(errors=errors)
 
 
-def discard_output() -> None:
-    """Send standard output nowhere from now on: what a closed pipe or a full disk did not take is not tried again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 class _PrintHandler(logging.Handler):
     """Prints what the package logs: findings on standard output, warnings on standard error."""
 
@@ -93,19 +88,18 @@ def _log_printed(level_printed: int) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _end(number: int, frame: Any) -> None:
-    """Handle a signal: leave the program as Ctrl-C does, so that unfinished files are removed and workers stopped."""
-    sys.exit(128 + number)
-
-
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program instead of killing it."""
-    names = [name for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)]  # Windows has no SIGHUP
-    numbers = [getattr(signal, name) for name in names]
+    """Let a lost terminal (SIGHUP) and a termination request (SIGTERM) unwind the program as Ctrl-C does instead of
+    killing it, so that unfinished files are removed and workers stopped."""
+
+    def end(number: int, frame: Any) -> None:
+        sys.exit(128 + number)
+
+    numbers = [getattr(signal, name) for name in ("SIGHUP", "SIGTERM") if hasattr(signal, name)]  # none on Windows
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         numbers = []
-    before = {n: signal.signal(n, _end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
+    before = {n: signal.signal(n, end) for n in numbers if signal.getsignal(n) is signal.SIG_DFL}
     try:
         yield
     finally:
@@ -131,9 +125,8 @@ def _what_failed(error: Exception) -> str:
 
 
 def _is_bug(error: Exception) -> bool:
-    """Whether an error is none of the input or of the machine: a module of ours that is missing, a name that a
-    module lacks, or a RuntimeError
-    other than of torch's memory, which has no type of its own on a CPU."""
+    """Whether an error is none of the input or of the machine: a module of ours that is missing, a name that a module
+    lacks, or a RuntimeError other than of torch's memory, which has no type of its own on a CPU."""
     if isinstance(error, ModuleNotFoundError):
         return error.name is None or error.name.startswith(__package__.partition(".")[0])
     if isinstance(error, ImportError):
@@ -185,8 +178,8 @@ def main(args: list[str] | None = None) -> None:
     """Run one subcommand; by default that of the program's own arguments.
 
     Unusable input, files that cannot be read or written, a lack of memory and a missing package end it with one line
-    and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number
-    (:data:`pointsplat_ns.cli.help.STATUSES`). With ``--json``, standard output has one JSON value and nothing else.
+    and exit status 1; Ctrl-C ends it with 130, another signal with 128 plus its number. With ``--json``, standard
+    output has one JSON value and nothing else.
     """
     with any_text_printable():
         try:
@@ -194,7 +187,7 @@ def main(args: list[str] | None = None) -> None:
         except PointSplatError as error:
             text, status = f"error: {error}", 1
         except BrokenPipeError:  # of `pointsplat ... | head`
-            discard_output()
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what it did not take is not tried again
             sys.exit(1)
         except (ImportError, OSError, MemoryError, RuntimeError) as error:
             if _is_bug(error):

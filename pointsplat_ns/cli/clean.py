@@ -18,7 +18,6 @@ def clean(
     up: options.Up = None,
     data: options.Data = None,
     force: options.Force = False,
-    threads: options.Threads = None,
     json_output: options.Json = False,
 ) -> None:
     """Remove floaters, and what cannot be drawn or is seen from nowhere.
@@ -34,19 +33,16 @@ def clean(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.compacting import Looking, clean_source
-    from pointsplat_ns.compression.quality import quality_of_file
-    from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.system.threads import fixed_threads
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
 
     options.need_one_scene(scene)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "clean")
     options.check_outputs(output, force, picture)
-    looking, suffix = Looking(poses, resolution, up, data), format_to_write(output).suffix
-    with fixed_threads(threads):
-        dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
-        ps.save(cleaned, output, progress=True, overwrite=True)
-        quality = quality_of_file(dense, source, cleaned, output, suffix)
+    looking = Looking(poses, resolution, up, data)
+    dense, cleaned, seconds, source = clean_source(scene, strength, looking, picture, True)
+    ps.save(cleaned, output, progress=True, overwrite=True)
+    quality = quality_of_file(judge_of(dense, source), cleaned, output)
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
         print_json({**scene_result(len(dense), cleaned, seconds, output), **compared, "picture": picture})

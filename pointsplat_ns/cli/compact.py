@@ -2,28 +2,51 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, replace
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from urllib.parse import quote
 
 import tyro
 
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.goals import GOALS, GoalName, file_for, print_next, print_use
-from pointsplat_ns.cli.printing import (
-    end_if_interrupted,
-    print_if_larger,
-    print_json,
-    print_result,
-    scene_result,
-    written_size,
-)
+from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result, written_size
 
 if TYPE_CHECKING:
-    from pointsplat_ns.compression.compacted import Compacted
     from pointsplat_ns.compression.quality import Quality
     from pointsplat_ns.folders import SceneResult
-    from pointsplat_ns.gaussians import Gaussians
+
+GoalName = Literal["web", "phone", "headset", "email"]
+
+
+class Goal(NamedTuple):
+    """What a purpose asks for."""
+
+    suffix: str | None = None
+    """Suffix of the file; None for that of the scene."""
+    keep: str | None = None
+    """Budget; None for the usual one."""
+    page: bool = False
+    """Whether a page with the scene alone is written beside the file."""
+    page_mb: float = 60.0
+    """Largest page, in units of 10^6 bytes."""
+    use: str = "to fly through in a browser"
+    """Text on the use of a page."""
+
+
+GOALS: dict[GoalName | None, Goal] = {
+    None: Goal(),
+    "web": Goal(
+        ".sog", "2MB", True, use="to upload; paste this where the scene is to appear:\n"
+        '<iframe src="{url}" title="{name}" style="width: 100%; height: 30rem; border: 0" allowfullscreen></iframe>',
+    ),
+    "phone": Goal(".sog", "500000gaussians"),
+    "headset": Goal(".spz", "400000gaussians"),
+    "email": Goal(".spz", "5MB", True, 10.0, "to fly through after a double click, also offline"),
+}  # fmt: skip
+"""Sources of the figures: docs/guides/downloaded_splat.md."""
 
 
 def compact(
@@ -31,7 +54,7 @@ def compact(
     output: options.Output = None,
     goal: Annotated[GoalName | None, tyro.conf.arg(name="for")] = None,
     keep: str | None = None,
-    refiner: Annotated[Path | None, tyro.conf.arg(aliases=["--using"])] = None,
+    refiner: Path | None = None,
     by: str | None = None,
     sh: options.Bands = "all",
     clean: bool = False,
@@ -45,10 +68,8 @@ def compact(
     data: options.Data = None,
     picture: Path | None = None,
     html: Path | None = None,
-    dry_run: bool = False,
     force: options.Force = False,
     jobs: options.Jobs = None,
-    threads: options.Threads = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
@@ -73,7 +94,7 @@ def compact(
         keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
             default the budget of the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
-            a .safetensors file, or shipped; by default none. --using is the same.
+            a .safetensors file, or shipped; by default none.
         by: the method of prune; by default the method of the refiner's training; without a refiner merge.
         sh: SH bands to keep, as for prune: all, up to a degree, or auto.
         clean: as for prune: first remove Gaussians that cannot be drawn or seen.
@@ -90,12 +111,10 @@ def compact(
             folder, all scenes before and after; by default none.
         html: an .html file that opens offline in a browser, to fly through the scene before and after, with a wipe
             between them; for a folder, a gallery of all scenes before and after; by default none.
-        dry_run: compute and print everything, but write no scene.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.scene import is_folder_of_scenes
-    from pointsplat_ns.system.threads import fixed_threads
 
     chosen = GOALS[goal]
     unasked = goal is None and keep is None and refiner is None and target_db is None
@@ -103,48 +122,52 @@ def compact(
     if is_folder_of_scenes(scene):
         from pointsplat_ns.folders import output_folder
 
-        for name, given in {"--poses": poses, "--up": up, "--photos": photos, "--dry-run": dry_run}.items():
+        for name, given in {"--poses": poses, "--up": up, "--photos": photos}.items():
             if given is not None and given is not False:
                 raise ps.SceneError(f"{name} is for one scene; {scene} is a folder of scenes")
         folder = output or output_folder(scene)
-        with fixed_threads(threads):
-            results = ps.compact_folder(
-                scene, folder, keep, refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
-                target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
-                picture=picture, jobs=1 if jobs is None else jobs, force=force, progress=True,
-            )  # fmt: skip
+        results = ps.compact_folder(
+            scene, folder, keep, refiner, by=by, sh=sh, clean=clean, effort=effort, seconds=seconds,
+            target_db=target_db, resolution=resolution, data=data, target_format=chosen.suffix, html=html,
+            picture=picture, jobs=1 if jobs is None else jobs, force=force, progress=True,
+        )  # fmt: skip
         return _print_folder(results, folder, [path for path in (html, picture) if path is not None], json_output)
     if jobs is not None:
         raise ps.SceneError(f"{scene}: one scene; --jobs is for a folder of scenes")
     from pointsplat_ns.compacting import Looking, compact_source
-    from pointsplat_ns.compression.quality import quality_of_file
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
     from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
-    from pointsplat_ns.compression.trained_refiner import refiner_at
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.runs import name_of
 
     options.check_poses(poses)
-    output = file_for(goal, scene, output)
-    written = None if dry_run else output
-    alone = chosen.page and html is None and not dry_run
+    if output is not None and chosen.suffix is not None and not output.name.lower().endswith(chosen.suffix):
+        raise ps.SceneError(
+            f"{output}: --for {goal} writes {chosen.suffix}; expected such a name, or --keep in place of --for"
+        )
+    output = output or options.output_beside(scene, goal or "compact", chosen.suffix)
+    alone = chosen.page and html is None
     html = output.with_suffix(".html") if alone else html
-    options.check_outputs(written, force, picture, html)
-    kind = format_to_write(output)
-    request = CompactRequest.of(
-        refiner_at(refiner), keep, by, sh, clean, RepairBudget(effort, seconds), bool(photos), kind.suffix, target_db
-    )
+    options.check_outputs(output, force, picture, html)
+    budget, suffix = RepairBudget(effort, seconds), format_to_write(output).suffix
+    trained = None if refiner is None else ps.load_refiner(refiner)
+    request = CompactRequest.of(trained, keep, by, sh, clean, budget, bool(photos), suffix, target_db)
     looking = Looking(poses, resolution, up, data, photos)
-    with fixed_threads(threads):
-        dense, result, source = compact_source(scene, request, looking, progress=True)
-    if not dry_run:
-        ps.save(result.scene, output, progress=True, overwrite=True)
-    quality = quality_of_file(dense, source, result.scene, written, kind.suffix)
+    dense, result, source = compact_source(scene, request, looking, progress=True)
+    ps.save(result.scene, output, progress=True, overwrite=True)
+    quality = quality_of_file(result.judge or judge_of(dense, source), result.scene, output)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)
-    files = [_file_text(scene), "not written" if written is None else _file_text(written)]
+    files = [_file_text(scene), _file_text(output)]
     shown = None if picture is None else ps.plot_comparison(dense, result, picture, files, quality)
     if html is not None:
-        _write_page(scene, [dense, result.scene][alone:], result, files, html, up, quality, chosen.page_mb)
+        names = None if alone else [f"dense ({files[0]})", f"compact ({files[1]})"]
+        notes = [] if alone or quality is None else [f"{quality}"]
+        sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
+        ps.write_page(
+            [dense, result.scene][alone:], html, names, title=name_of(scene), notes=notes,
+            views=None if sampled else result.views, up=up, limit_mb=chosen.page_mb, progress=True,
+        )  # fmt: skip
     if json_output:
         made = {
             "refined": result.accepted,
@@ -153,20 +176,21 @@ def compact(
             "picture": picture,
             "html": html,
         }
-        print_json({**scene_result(len(dense), result.scene, result.seconds, written), **made})
-        return end_if_interrupted(result.interrupted)
-    also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
-    also += ["trained on photos"] * (result.last.photos is not None)
-    print_result(request.prune.by, also, len(dense), result.scene, result.seconds, written, quality)
-    print_if_larger(scene, written)
-    if verbose and quality is not None:
-        print(quality.details)
-    if shown is not None:
-        print(shown)
-    print_use(goal, html, name_of(scene), quality)
-    end_if_interrupted(result.interrupted)
-    if unasked and written is not None:
-        print_next(scene, written, quality)
+        print_json({**scene_result(len(dense), result.scene, result.seconds, output), **made})
+    else:
+        also = ["refined"] * result.accepted + ["repaired"] * result.repair_accepted
+        also += ["trained on photos"] * (result.last.photos is not None)
+        print_result(request.prune.by, also, len(dense), result.scene, result.seconds, output, quality)
+        print_if_larger(scene, output)
+        if verbose and quality is not None:
+            print(quality.details)
+        if shown is not None:
+            print(shown)
+        _print_use(goal, html, name_of(scene), quality)
+    if result.interrupted:
+        raise KeyboardInterrupt  # once the best result so far is written and printed
+    if unasked and not json_output:
+        _print_next(scene, output, quality)
 
 
 def _print_folder(results: list[SceneResult], folder: Path, shown: list[Path], json_output: bool) -> None:
@@ -204,25 +228,22 @@ def _file_text(path: Path) -> str:
     return f"{path.name}, {written_size(file)}" if file.is_file() and file.suffix != ".yml" else name_of(path)
 
 
-def _write_page(
-    scene: Path,
-    shown: list[Gaussians],
-    result: Compacted,
-    files: list[str],
-    html: Path,
-    up: str | None,
-    quality: Quality | None,
-    limit_mb: float,
-) -> None:
-    """The page to fly through the result alone, or the scene before and after."""
-    import pointsplat_ns as ps
-    from pointsplat_ns.io.runs import name_of
+def _print_use(goal: GoalName | None, page: Path | None, name: str, quality: Quality | None) -> None:
+    """Print what a page of the scene called ``name`` is for; for a headset, also the fill, which can slow it."""
+    if page is not None:
+        use = GOALS[goal].use.format(url=quote(page.name), name=escape(name))
+        print(f"{page}: {written_size(page)}, {use}")
+    if goal == "headset" and quality is not None:
+        fill = f"{quality.fill_before:.1f} -> {quality.fill:.1f} Gaussians drawn per pixel"
+        print(f"fill: {fill}; where it is too slow near things, a smaller --keep lowers it")
 
-    both = len(shown) > 1
-    names = [f"{name} ({file})" for name, file in zip(("dense", "compact"), files, strict=True)] if both else None
-    notes = [f"{quality}"] if both and quality is not None else []
-    sampled = any(note.startswith("views: sampled") for note in result.notes)  # the page opens better without these
-    ps.write_page(
-        shown, html, names, title=name_of(scene), notes=notes, views=None if sampled else result.views, up=up,
-        limit_mb=limit_mb, progress=True,
-    )  # fmt: skip
+
+def _print_next(scene: Path, output: Path, quality: Quality | None) -> None:
+    """Print two commands to try after a budget that nobody chose: a look at the result, and another budget where its
+    PSNR asks for one, else a goal."""
+    share = "30%" if quality is not None and quality.psnr < 27.0 else "3%" if quality and quality.psnr > 35.0 else None
+    other = (
+        ["--for", "web"] if share is None else ["--keep", share, "-o", str(options.output_beside(scene, share[:-1]))]
+    )
+    commands = ["pointsplat", "view", str(scene), str(output)], ["pointsplat", "compact", str(scene), *other]
+    print("next: " + "\n      ".join(map(shlex.join, commands)))

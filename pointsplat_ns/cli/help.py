@@ -39,16 +39,6 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 }
 """Command lines of every command, with the purpose of each."""
 
-STATUSES = {
-    0: "done",
-    1: "an error, in one line on standard error; with a traceback, a bug of ours",
-    2: "a command line that is not understood",
-    129: "the terminal was lost (SIGHUP)",
-    130: "interrupted by Ctrl-C (SIGINT)",
-    143: "asked to end (SIGTERM)",
-}
-"""Meanings of exit statuses."""
-
 
 def after_help(args: list[str]) -> str:
     """Text to print after the help that arguments ask for; empty if they ask for none."""
@@ -57,7 +47,13 @@ def after_help(args: list[str]) -> str:
     if args[0] in EXAMPLES:
         lines = [line for what, command in EXAMPLES[args[0]] for line in (f"  # {what}", f"  {command}")]
         return "\n".join(["examples:", *lines])
-    table = [f"  {status:<5}{meaning}" for status, meaning in STATUSES.items()]
-    examples = "`pointsplat COMMAND --help` has examples."
-    completion = "Completion in your shell: `pointsplat --tyro-write-completion bash FILE`; zsh and tcsh as well."
-    return "\n".join(["exit status:", *table, "", examples, completion])
+    return """exit status:
+  0    done
+  1    an error, in one line on standard error; with a traceback, a bug of ours
+  2    a command line that is not understood
+  129  the terminal was lost (SIGHUP)
+  130  interrupted by Ctrl-C (SIGINT)
+  143  asked to end (SIGTERM)
+
+`pointsplat COMMAND --help` has examples.
+Completion in your shell: `pointsplat --tyro-write-completion bash FILE`; zsh and tcsh as well."""

@@ -28,7 +28,6 @@ def lod(
     up: options.Up = None,
     data: options.Data = None,
     force: options.Force = False,
-    threads: options.Threads = None,
     json_output: options.Json = False,
 ) -> None:
     """Make levels of detail: the scene merged to fewer and fewer Gaussians in one pass, the error of each measured.
@@ -58,17 +57,15 @@ def lod(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.io.discovery import FOLDER_FILES
-    from pointsplat_ns.system.threads import fixed_threads
 
     options.need_one_scene(scene)
     options.check_poses(poses)
     folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod", "")
     for_viewers = stream or tiles or folder.suffix.lower() == ".rad"
-    with fixed_threads(threads):
-        made = ps.lod(
-            scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force, progress=True,
-        )  # fmt: skip
+    made = ps.lod(
+        scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
+        data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force, progress=True,
+    )  # fmt: skip
     if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
     elif json_output:

@@ -42,23 +42,14 @@ def print_json(content: Any) -> None:
     print(json_text(content), file=_OUTPUT.get(), flush=True)
 
 
-def end_if_interrupted(interrupted: bool) -> None:
-    """End a command that Ctrl-C interrupted as Ctrl-C does, once the best result so far is written and printed."""
-    if interrupted:
-        raise KeyboardInterrupt
-
-
-def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path | None) -> dict[str, Any]:
-    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one. Without a written
-    file, as in a dry run, ``bytes`` are those of a PLY."""
-    from pointsplat_ns.pruning import ply_bytes
-
+def scene_result(before: int | None, scene: Gaussians | PlyRows, seconds: float, where: Path) -> dict[str, Any]:
+    """The JSON values of a result, from ``before`` Gaussians in the dense scene, if there is one."""
     return {
         "output": where,
         **({} if before is None else {"gaussians_before": before}),
         "gaussians": len(scene),
         "sh_degree": scene.sh_degree,
-        "bytes": ply_bytes(len(scene), scene.sh_degree) if where is None else where.stat().st_size,
+        "bytes": where.stat().st_size,
         "seconds": seconds,
     }
 
@@ -69,29 +60,24 @@ def print_result(
     before: int,
     scene: Gaussians | PlyRows,
     seconds: float,
-    where: Path | None,
+    where: Path,
     quality: Quality | str | None,
 ) -> None:
-    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file (that of a
-    PLY in a dry run) and time, and how close the file is to the dense scene, or why that is not known."""
-    from pointsplat_ns.io.files import bytes_text
-    from pointsplat_ns.pruning import ply_bytes
-
+    """Print what was done by a method and ``also`` after it (refined, repaired), counts, size of the file and time, and
+    how close the file is to the dense scene, or why that is not known."""
     *first, last = [{"merge": "merged", "clean": "cleaned"}.get(by, f"pruned by {by}"), *also]
     done = f"{', '.join(first)} and {last}" if first else last
-    size = bytes_text(ply_bytes(len(scene), scene.sh_degree)) + " as .ply" if where is None else written_size(where)
-    place = "dry run, nothing is written" if where is None else where
     what = f"{done} to {len(scene):,} of {before:,} Gaussians ({100 * len(scene) / before:.3g} %)"
     if len(scene) == before and not also:
         nothing = {"merge": "nothing is merged", "clean": "nothing is removed"}.get(by, "nothing is pruned")
         what = f"{nothing}, all {before:,} Gaussians fit as they are"
-    print(f"{place}: {what}, {size}, in {seconds_text(seconds)}")
+    print(f"{where}: {what}, {written_size(where)}, in {seconds_text(seconds)}")
     print(quality or "not compared with the dense scene: nothing of it is visible")
 
 
-def print_if_larger(scene: Path, where: Path | None) -> None:
+def print_if_larger(scene: Path, where: Path) -> None:
     """Print a note if a result takes more bytes than the scene's file, whose format has fewer for each Gaussian."""
-    if where is not None and scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
+    if scene.is_file() and scene.suffix != ".yml" and scene.stat().st_size < where.stat().st_size:
         remedy = "" if scene.suffix == where.suffix else f"; a name that ends in {scene.suffix} makes it smaller"
         print(f"note: {where} is larger than {scene}: {written_size(where)}, not {written_size(scene)}{remedy}")
 

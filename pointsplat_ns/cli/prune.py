@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from pointsplat_ns.cli import scene_options as options
-from pointsplat_ns.cli.printing import (
-    print_if_larger,
-    print_json,
-    print_result,
-    scene_result,
-)
+from pointsplat_ns.cli.printing import print_if_larger, print_json, print_result, scene_result
 
 
 def prune(
@@ -26,12 +19,9 @@ def prune(
     up: options.Up = None,
     data: options.Data = None,
     photos: options.Photos = False,
-    plot: Path | None = None,
-    dry_run: bool = False,
     force: options.Force = False,
     jobs: options.Jobs = None,
     memory: options.Megabytes | None = None,
-    threads: options.Threads = None,
     verbose: options.Verbose = False,
     json_output: options.Json = False,
 ) -> None:
@@ -55,8 +45,6 @@ def prune(
         photos: also print PSNR in held-out photos: of the dataset of a run, or every eighth photo, by name, in FOLDER.
             Nothing is trained. Its poses, those of --poses or of a file of cameras there, above it or beside the scene,
             are then the views.
-        plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
-        dry_run: compute and print everything, but write no scene.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
             parts, with files beside the output; a command that was killed resumes. With --jobs each process may
             take so much.
@@ -66,55 +54,44 @@ def prune(
     from pointsplat_ns.compacting import Looking, prune_source
     from pointsplat_ns.comparing.sizes import parse_resolution
     from pointsplat_ns.compression.prune_file import prune_file, rows_to_prune
-    from pointsplat_ns.compression.quality import quality_of_file
+    from pointsplat_ns.compression.quality import judge_of, quality_of_file
     from pointsplat_ns.compression.requests import PruneRequest
     from pointsplat_ns.io.formats import format_to_write
     from pointsplat_ns.io.ply import PlyRows
     from pointsplat_ns.looking.upright import up_named
     from pointsplat_ns.system.progress import progress_bar
-    from pointsplat_ns.system.threads import fixed_threads
 
     options.need_one_scene(scene)
     options.check_poses(poses)
     output = output or options.output_beside(scene, "pruned")
-    written = None if dry_run else output
-    options.check_outputs(written, force, plot)
-    suffix = format_to_write(output).suffix
-    request = PruneRequest(keep, by, sh, opacity_weight, clean, suffix)
+    options.check_outputs(output, force)
+    request = PruneRequest(keep, by, sh, opacity_weight, clean, format_to_write(output).suffix)
     limit = None if memory is None else 1e6 * memory
     rows = rows_to_prune(scene, request, limit)
-    dense: ps.Gaussians | None = None
-    small: ps.Gaussians | PlyRows | None
-    with fixed_threads(threads):
-        if rows is None:
-            if jobs is not None:
-                raise ps.SceneError(f"{scene}: fits into memory; --jobs is for a scene that is merged in parts")
-            looking = Looking(poses, resolution, up, data, photos)
-            dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
-            small, before = pruned, len(dense)
-            if not dry_run:
-                ps.save(pruned, output, progress=True, overwrite=True)
-            quality = quality_of_file(dense, source, pruned, written, suffix)
-            if plot is not None:
-                ps.plot_distributions({"before": dense, "after": pruned}, plot)
-        elif dry_run or plot is not None or photos is not False:
-            raise ps.SceneError(f"{scene}: does not fit into memory; expected no --dry-run, --plot or --photos")
-        else:
-            processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
-            with progress_bar() as report:
-                before, seconds = prune_file(
-                    rows, output, request, limit, poses, size, up_named(up), report, jobs=processes
-                )
-            small, quality = PlyRows.open(output), None
-    assert small is not None
+    small: ps.Gaussians | PlyRows
+    if rows is None:
+        if jobs is not None:
+            raise ps.SceneError(f"{scene}: fits into memory; --jobs is for a scene that is merged in parts")
+        looking = Looking(poses, resolution, up, data, photos)
+        dense, small, seconds, source = prune_source(scene, request, looking, progress=True)
+        before = len(dense)
+        ps.save(small, output, progress=True, overwrite=True)
+        quality = quality_of_file(judge_of(dense, source), small, output)
+    elif photos is not False:
+        raise ps.SceneError(f"{scene}: does not fit into memory; expected no --photos")
+    else:
+        processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
+        with progress_bar() as report:
+            before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report, processes)
+        written, quality = PlyRows.open(output), None
+        assert written is not None
+        small = written
     if json_output:
         compared = quality.as_dict() if quality else {"psnr": None}
-        print_json({**scene_result(before, small, seconds, written), **compared, "plot": plot})
+        print_json({**scene_result(before, small, seconds, output), **compared})
         return
     unknown = "not compared with the dense scene: it does not fit into memory"
-    print_result(by, [], before, small, seconds, written, quality if rows is None else unknown)
-    print_if_larger(scene, written)
+    print_result(by, [], before, small, seconds, output, quality if rows is None else unknown)
+    print_if_larger(scene, output)
     if verbose and quality is not None:
         print(quality.details)
-    if plot is not None:
-        print(f"{plot}: opacity and volume, before and after")

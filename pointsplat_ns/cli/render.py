@@ -47,7 +47,8 @@ def render(
 
     start = time.perf_counter()
     options.check_poses(poses)
-    output = output or _beside(scene)
+    beside = options.output_beside(scene, "render", ".mp4")
+    output = output or (beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4"))
     count = ps.render_path(
         scene, output, other, views=poses, up=up, data=data, width=width, height=height,
         fps=fps, seconds=seconds, force=force, progress=True,
@@ -59,11 +60,3 @@ def render(
         return
     frames = "1 frame" if count == 1 else f"{count} frames"
     print(f"{output}: {frames}, {bytes_text(size)}, in {seconds_text(seconds_taken)}")
-
-
-def _beside(scene: Path) -> Path:
-    """The default video: beside a file, in the folder of a run."""
-    from pointsplat_ns.cli.scene_options import output_beside
-
-    beside = output_beside(scene, "render", ".mp4")
-    return beside if beside.name == "render.mp4" else beside.with_name(f"{scene.stem}.mp4")

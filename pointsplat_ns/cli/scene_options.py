@@ -56,17 +56,7 @@ Jobs = Annotated[
         "cores; by default 1."
     ),
 ]
-Threads = Annotated[
-    int | None,
-    tyro.conf.arg(
-        help="number of threads of each process. By default it adapts to the work and to other programs. Another "
-        "number may change results by rounding."
-    ),
-]
-Verbose = Annotated[
-    bool,
-    tyro.conf.arg(help="print more: what was chosen for the scene."),
-]
+Verbose = Annotated[bool, tyro.conf.arg(help="print more: what was chosen for the scene.")]
 Json = Annotated[
     bool, tyro.conf.arg(name="json", help="print the result as JSON, and nothing else on standard output.")
 ]
@@ -155,14 +145,6 @@ def _spec(metavar: str, parse: Callable[[str], Any]) -> PrimitiveConstructorSpec
         is_instance=lambda value: value is None or isinstance(value, (int, float)) and not isinstance(value, bool),
         str_from_instance=lambda value: [f"{value:g}" if isinstance(value, float) else str(value)],
     )
-
-
-def _share(text: str) -> float:
-    return parse_number(text[:-1]) / 100 if text.endswith("%") else parse_number(text)
-
-
-Share = Annotated[float, _spec("SHARE", _share)]
-"""A share of the Gaussians, such as 0.1 or 10%."""
 
 
 def _photos(words: list[str]) -> Path | bool:

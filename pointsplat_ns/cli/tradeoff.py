@@ -29,7 +29,6 @@ def tradeoff(
     data: options.Data = None,
     photos: Path | None = None,
     force: options.Force = False,
-    threads: options.Threads = None,
     json_output: options.Json = False,
 ) -> None:
     """Measure how a scene trades quality for frame time, size and count, on this machine: each method and repair at
@@ -50,17 +49,15 @@ def tradeoff(
     options.need_scenes(scene)
     import pointsplat_ns as ps
     from pointsplat_ns.compression.quality import quality_line
-    from pointsplat_ns.system.threads import fixed_threads
     from pointsplat_ns.tradeoff.points import RESULTS
     from pointsplat_ns.tradeoff.recommend import next_best
 
     options.check_poses(poses)
     folder = output or options.output_beside(scene, "tradeoff", "")
-    with fixed_threads(threads):
-        found = ps.measure_tradeoff(
-            scene, folder, keep=keep, within=within, by=by, repairs=repairs, views=views, poses=poses,
-            resolution=resolution, up=up, data=data, photos=photos, force=force, progress=True,
-        )  # fmt: skip
+    found = ps.measure_tradeoff(
+        scene, folder, keep=keep, within=within, by=by, repairs=repairs, views=views, poses=poses,
+        resolution=resolution, up=up, data=data, photos=photos, force=force, progress=True,
+    )  # fmt: skip
     if json_output:
         print_json({"output": folder, **json.loads((folder / RESULTS["json"]).read_text("utf-8"))})
         return

@@ -7,7 +7,6 @@ lowers the error in at least half of the views, and harms no picture of another 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum, auto
 
 from pointsplat_ns.comparing.closeness import Closeness, DenseReference
 from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
@@ -28,22 +27,8 @@ class AcceptanceSettings:
 
 ACCEPTANCE = AcceptanceSettings()
 
-
-class Reason(Enum):
-    """Reason to leave a change out."""
-
-    NO_GAIN = auto()
-    """PSNR does not rise."""
-    SMALL_GAIN = auto()
-    """PSNR rises by less than :attr:`AcceptanceSettings.min_gain`."""
-    MOST_VIEWS = auto()
-    """The error rises in most views."""
-    OTHER_SIZES = auto()
-    """PSNR falls in pictures of another size."""
-    NOT_FINITE = auto()
-    """Some of the changed Gaussians are not finite."""
-    NOT_COMPARED = auto()
-    """There are no views to compare renders in."""
+SMALL_GAIN = f"it brings less than {ACCEPTANCE.min_gain:g} dB"
+"""Why a change with a smaller gain is left out."""
 
 
 class Comparison:
@@ -68,8 +53,8 @@ class Comparison:
 
     def judged(
         self, before: Closeness, old: Gaussians, new: Gaussians, progress: Progress = silent
-    ) -> tuple[Closeness, Reason | None]:
-        """Errors of a changed scene, and why it is left out; None if it is kept.
+    ) -> tuple[Closeness, str]:
+        """Errors of a changed scene, and why it is left out; empty if it is kept.
 
         Args:
             before: errors of ``old``.
@@ -79,21 +64,23 @@ class Comparison:
         end = new.to(self.device)
         after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
         reason = _why_no_gain(before, after)
-        if reason is None and self._others is not None:
+        if not reason and self._others is not None:
             least = (psnr - ACCEPTANCE.most_loss for psnr in self._others.psnrs(old.to(self.device)))
             if not all(psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)):  # NaN too
-                reason = Reason.OTHER_SIZES
+                reason = "it harms pictures of another size"
         return after, reason
 
 
-def _why_no_gain(before: Closeness, after: Closeness) -> Reason | None:
-    """Why errors are no improvement; None if PSNR rises by :attr:`AcceptanceSettings.min_gain` or more, and the error
+def _why_no_gain(before: Closeness, after: Closeness) -> str:
+    """Why errors are no improvement; empty if PSNR rises by :attr:`AcceptanceSettings.min_gain` or more, and the error
     falls in at least half of the views. The second condition refuses a gain of few views at the cost of the others."""
+    if after.errors == before.errors:
+        return "it changes nothing"
     if after.psnr <= before.psnr:
-        return Reason.NO_GAIN
+        return "it does not help"
     if not after.psnr >= before.psnr + ACCEPTANCE.min_gain:  # NaN too
-        return Reason.SMALL_GAIN
-    return Reason.MOST_VIEWS if 2 * closer_in(before, after) < len(before.errors) else None
+        return SMALL_GAIN
+    return "it is farther in most views" if 2 * closer_in(before, after) < len(before.errors) else ""
 
 
 def closer_in(before: Closeness, after: Closeness) -> int:

@@ -37,7 +37,7 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.views import View, Views
 
 PLACES = 16
-"""Number of places of cameras. More places remove less and take longer."""
+"""Number of places of cameras: more remove less and take longer."""
 
 FLOATING = 0.25
 """Largest difference in colour, root of the sum of squares of red, green and blue, of a Gaussian that floats right
@@ -104,7 +104,10 @@ def find_junk(
             views = _views_all_around(part)
         except DataError:
             return Junk(undrawable.cpu(), drawn[:0].cpu(), drawn[:0].cpu(), 0)
-        has_pixels = _has_pixels(part, views, progress)
+        has_pixels = torch.zeros_like(drawn, dtype=torch.bool)
+        for done, pixels in enumerate(each_view(part, views, pixels_of)):
+            has_pixels |= pixels > 0
+            progress("looking for unseen Gaussians", (done + 1) / len(views))
         places = len(views) // 6
         visible[drawn] = has_pixels | ~has_pixels.any()  # empty images are no evidence
     floats = order[:0]
@@ -165,15 +168,6 @@ def clusters(scene: Gaussians) -> Tensor:
     return labels.bincount().argsort(descending=True, stable=True).argsort()[labels]
 
 
-def _has_pixels(scene: Gaussians, views: Views, progress: Progress) -> Tensor:
-    """Whether each Gaussian (N,) has a blend weight on any pixel of any view."""
-    has_pixels = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-    for done, pixels in enumerate(each_view(scene, views, pixels_of)):
-        has_pixels |= pixels > 0
-        progress("looking for unseen Gaussians", (done + 1) / len(views))
-    return has_pixels
-
-
 def clean_scene(
     dense: Gaussians, at_least: int, views: ViewSource, progress: Progress = silent, strength: float | None = None
 ) -> Cleaning:
@@ -205,17 +199,15 @@ def clean_scene(
         rules.append((dropped.floating, dropped.indices, f"that float before what {len(floating)} views show, {found}"))
     notes = []
     for gone, so_far, what in rules if len(dropped.undrawable) else rules[1:]:
-        close = "" if reference is None or len(gone) == 0 else _closeness(reference, _without(dense, so_far))
+        close = ""
+        if reference is not None and len(gone):
+            psnr, worst = reference.psnr(_without(dense, so_far))
+            seen = views_text(len(reference.views))
+            close = f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {seen}"
+            if math.isinf(psnr):
+                close = f"; renders of {seen} stay the same"
         notes.append(f"clean: {len(gone):,} of {len(dense):,} removed {what}{close}")
     return Cleaning(junk, len(dense), tuple(notes))
-
-
-def _closeness(reference: DenseReference, scene: Gaussians) -> str:
-    psnr, worst = reference.psnr(scene)
-    views = views_text(len(reference.views))
-    if math.isinf(psnr):
-        return f"; renders of {views} stay the same"
-    return f"; renders reach {psnr:.1f} dB against the dense scene's, {worst:.1f} dB in the worst of {views}"
 
 
 def _without(scene: Gaussians, indices: Tensor) -> Gaussians:
@@ -235,7 +227,9 @@ def _views_all_around(scene: Gaussians) -> Views:
     # few of the likeliest are behind walls; views for comparisons have another seed
     views = Sampler(without_sh).views(PLACES, seed=17, likeliest=True)
     places = invert_rigid(views.viewmats)[:, :3, 3]
-    rotations = _six_directions().to(places)
+    forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
+    right = forward.roll(1, dims=1)
+    rotations = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1).to(places)  # OpenCV axes
     viewmats = torch.eye(4, **FLOATS).to(places).repeat(len(places), 6, 1, 1)
     viewmats[..., :3, :3] = rotations
     viewmats[..., :3, 3] = -torch.einsum("dij,pj->pdi", rotations, places)
@@ -245,11 +239,3 @@ def _views_all_around(scene: Gaussians) -> Views:
     K = torch.tensor([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]], **FLOATS)
     viewmats = viewmats.flatten(0, 1)
     return Views(viewmats, K.repeat(len(viewmats), 1, 1), side, side, torch.zeros(3, **FLOATS))
-
-
-def _six_directions() -> Tensor:
-    """World-to-camera rotations (6, 3, 3) of the faces of a cube, OpenCV axes."""
-    forward = torch.cat([torch.eye(3, **DOUBLES), -torch.eye(3, **DOUBLES)])
-    right = forward.roll(1, dims=1)
-    down = torch.linalg.cross(forward, right)
-    return torch.stack([right, down, forward], dim=1)

@@ -1,23 +1,29 @@
 """Compacts a scene in stages: prune, refine, repair, and round for a file of limited size. Refinement and repair are
-accepted by comparing renders with those of the dense scene."""
+accepted by comparing renders with those of the dense scene. For a PSNR after all stages, counts are searched."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import time
+from dataclasses import replace
 
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.compression.acceptance import ACCEPTANCE, Comparison, Reason
-from pointsplat_ns.compression.budget_search import FileLimit
+from pointsplat_ns.compression.acceptance import ACCEPTANCE, SMALL_GAIN, Comparison
+from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
 from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
+from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget, default_device
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.io.files import bytes_text
+from pointsplat_ns.io.formats import format_to_write
+from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.photos.examples import Photos
 from pointsplat_ns.system.progress import Progress, silent
@@ -47,18 +53,18 @@ def compact_scene(
     request.check_sh_degree(dense)
     views = views or ViewSource(dense)
     pruned = prune_scene(dense, request.prune, views, progress, rounding=False)
-    at_work = dense.to(request.device)
+    at_work = dense.to(default_device() if request.refiner is None else request.refiner.device)
     judge, reference, uncompared = None, None, ""
     try:
         progress("comparing renders", 0.0)
         judge = Comparison(at_work, views)
         reference = judge.reference
     except DataError as error:
-        uncompared = str(error)
+        uncompared = f"it cannot be compared with the dense scene ({error})"
     before = None if reference is None else reference.closeness(pruned.scene.to(at_work.device))
     stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
-        stages.append(_refined(stages[0], request.refiner, judge, progress))
+        stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
     error_left = last_kept(stages).after
     if judge is not None and error_left is not None and error_left.psnr < math.inf and not request.repair.empty:
         stages.append(_repaired(last_kept(stages), at_work, request.repair, judge, views, progress))
@@ -73,14 +79,17 @@ def compact_scene(
     return Compacted(tuple(stages), (*seen, *pruned.notes), reference, seconds, uncompared, interrupted=interrupted)
 
 
-def _refined(last: Stage, refiner: TrainedRefiner, judge: Comparison | None, progress: Progress) -> Stage:
+def _refined(
+    last: Stage, refiner: TrainedRefiner, judge: Comparison | None, uncompared: str, progress: Progress
+) -> Stage:
     """The refinement of the last stage by a network."""
     progress("refining", 0.0)
     refined = refiner(last.scene)
-    if bool((last.scene.usable() & ~refined.usable()).any()):
-        return Stage("refine", refined, None, last.after, reason=Reason.NOT_FINITE)
+    unsound = int((last.scene.usable() & ~refined.usable()).sum())
+    if unsound:
+        return Stage("refine", refined, None, last.after, f"{unsound:,} of {len(refined):,} Gaussians are not finite")
     if judge is None or last.after is None:
-        return Stage("refine", refined, None, reason=Reason.NOT_COMPARED)
+        return Stage("refine", refined, None, reason=uncompared)
     after, reason = judge.judged(last.after, last.scene, refined, progress)
     return Stage("refine", refined, after, last.after, reason)
 
@@ -111,8 +120,8 @@ def _trained(
     progress("training on photos", 0.0)
     report = functools.partial(progress, "training on photos")
     trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = None if trained.lost <= PHOTO_REPAIR.most_lost else Reason.NO_GAIN
-    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else Reason.SMALL_GAIN  # NaN too
+    reason = "" if trained.lost <= PHOTO_REPAIR.most_lost else f"other photos lose {trained.lost:.1f} dB"
+    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else SMALL_GAIN  # NaN too
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
     return Stage("photos", scene, after, last.after, reason, *figures, photos=trained)
@@ -125,3 +134,41 @@ def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | No
         return []
     after = None if reference is None else reference.closeness(scene.to(reference.renders[0].device))
     return [Stage("round", scene, after, last.after)]
+
+
+def compact_to_psnr(
+    dense: Gaussians, request: CompactRequest, views: ViewSource, progress: Progress = silent
+) -> Compacted:
+    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of
+    the request, in place of its budget.
+
+    Each count is judged as every command judges (:mod:`~pointsplat_ns.compression.quality`), after writing and reading
+    the scene in the format of the request. Ctrl-C ends the search with the smallest scene found so far, if any.
+
+    Raises:
+        BudgetError: if not even all Gaussians reach it.
+        SceneError, PointSplatError: as :func:`compact_scene`.
+        DataError: if there are no views.
+    """
+    assert request.target_db is not None
+    start, suffix, numbers = time.perf_counter(), request.prune.suffix, itertools.count(1)
+    judge, kind = Judge(dense, views), format_to_write(suffix)
+
+    def measure(count: int) -> tuple[float, Compacted]:
+        size = f"size {next(numbers)}"
+        asked = replace(request, prune=replace(request.prune, keep=count))
+        made = compact_scene(dense, asked, views, lambda what, share: progress(f"{size}: {what}", share))
+        if made.interrupted:
+            raise KeyboardInterrupt
+        if kind.rounded is not None and (psnr := judge.psnr(made.scene)[0]) <= ROUNDING.best_psnr:
+            limit = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree))
+            made = replace(made, stages=(*made.stages, *rounding_stage(made.last, limit, made.reference)))
+        written_bytes, written = through_file(made.scene, suffix)
+        psnr, _ = judge.psnr(written)
+        reached = f"{decibels(psnr)} against the dense scene in {judge.where}"
+        return psnr, replace(made, target=f"{reached}, {bytes_text(written_bytes)}, {len(made.scene):,} Gaussians")
+
+    best, found = smallest_within(len(dense), measure, request.target_db, stoppable=True)
+    target = f"{best.target}; {len(found.tried)} sizes tried" + (", interrupted" if found.interrupted else "")
+    seconds = time.perf_counter() - start
+    return replace(best, target=target, judge=judge, interrupted=found.interrupted, seconds=seconds)

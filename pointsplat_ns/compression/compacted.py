@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pointsplat_ns.comparing.closeness import Closeness, DenseReference
-from pointsplat_ns.compression.acceptance import ACCEPTANCE, Reason, closer_in
+from pointsplat_ns.compression.acceptance import closer_in
 from pointsplat_ns.compression.photo_repair import PhotoRepaired
-from pointsplat_ns.compression.quality import PhotoGain
+from pointsplat_ns.compression.quality import Judge, PhotoGain
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.views import Views
 
 
@@ -25,8 +26,8 @@ class Stage:
     """Errors of ``scene`` against the dense scene's renders; None if it was not compared."""
     before: Closeness | None = None
     """Errors of the scene before the stage; None for pruning."""
-    reason: Reason | None = None
-    """Why the stage is left out; None if it is kept."""
+    reason: str = ""
+    """Why the stage is left out; empty if it is kept."""
     steps: int = 0
     """Number of steps of a repair."""
     seconds: float = 0.0
@@ -39,7 +40,12 @@ class Stage:
     @property
     def accepted(self) -> bool:
         """Whether the stage is kept."""
-        return self.reason is None
+        return not self.reason
+
+    @property
+    def done(self) -> str:
+        """What the stage does to a scene, as a participle."""
+        return "trained" if self.name == "photos" else f"{self.name.removesuffix('e')}ed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +55,8 @@ class Compacted:
     Example:
         >>> import pointsplat_ns as ps
         >>> result = ps.compact(ps.example_room()[::10], keep="20%", effort="instant")
-        >>> result.scene is (result.refined if result.accepted else result.pruned)
-        True
+        >>> result.scene is result.pruned, result.accepted
+        (True, False)
     """
 
     stages: tuple[Stage, ...]
@@ -62,9 +68,11 @@ class Compacted:
     seconds: float
     """Total duration."""
     uncompared: str = ""
-    """Why there are no views to compare renders in; empty if there are."""
+    """Why renders cannot be compared; empty if they are."""
     target: str = ""
     """Text on the search for a PSNR: what was reached, and its cost; empty if there was no search."""
+    judge: Judge | None = None
+    """The judge of a search for a PSNR; None if there was no search."""
     interrupted: bool = False
     """Whether Ctrl-C ended the repair or the search for a PSNR early."""
 
@@ -83,13 +91,8 @@ class Compacted:
 
     @property
     def pruned(self) -> Gaussians:
-        """The scene before refinement."""
+        """The scene before refinement and repair."""
         return self.stages[0].scene
-
-    @property
-    def refined(self) -> Gaussians:
-        """The scene after refinement; ``pruned`` if there is no refiner."""
-        return (self._stage("refine") or self.stages[0]).scene
 
     @property
     def accepted(self) -> bool:
@@ -121,12 +124,6 @@ class Compacted:
         return self.stages[0].after
 
     @property
-    def after(self) -> Closeness | None:
-        """Errors of ``refined`` against the reference; None if it was not compared."""
-        refined = self._stage("refine")
-        return None if refined is None else refined.after
-
-    @property
     def psnr(self) -> float | None:
         """PSNR of ``scene`` against the dense scene's renders over the pixels that the dense scene covers, dB; None if
         nothing was compared."""
@@ -141,11 +138,11 @@ class Compacted:
     def verdict(self) -> str:
         """A line of text for each stage after pruning: its gain, or the reason to leave it out. One line if there is no
         such stage."""
-        lines = [_line(stage, self) for stage in self.stages[1:]]
+        lines = [_line(stage) for stage in self.stages[1:]]
         if lines:
             return "\n".join(lines)
         if self.before is None:
-            return f"not refined or repaired: {_uncompared(self)}"
+            return f"not refined or repaired: {self.uncompared}"
         return f"not repaired: {self.before.psnr:.1f} dB PSNR against the dense scene ({self.before.where})"
 
 
@@ -154,51 +151,17 @@ def last_kept(stages: Sequence[Stage]) -> Stage:
     return next(stage for stage in reversed(stages) if stage.accepted)
 
 
-def _line(stage: Stage, result: Compacted) -> str:
+def _line(stage: Stage) -> str:
+    cost = f" by {counted(stage.steps, 'step')} in {stage.seconds:.1f} s" if stage.name in ("repair", "photos") else ""
+    cost += ", interrupted" if stage.interrupted else ""
+    done = stage.done + {"refine": " by the network", "round": " for the size of the file"}.get(stage.name, "")
     if stage.photos is not None:
-        return _photo_line(stage, stage.photos)
-    if stage.name == "round":
-        figures = "" if stage.before is None or stage.after is None else f": {_figures(stage.before, stage.after)}"
-        return f"rounded for the size of the file{figures}"
-    done = "refined by the network" if stage.name == "refine" else "repaired"
-    before, after = stage.before, stage.after
-    if stage.reason is Reason.NOT_FINITE:
-        unsound = int((result.pruned.usable() & ~stage.scene.usable()).sum())
-        return f"not {done}: {unsound:,} of {len(stage.scene):,} refined Gaussians are not finite"
-    if before is None or after is None:
-        return f"not {done}: {_uncompared(result)}"
-    figures = _figures(before, after)
-    steps = "1 step" if stage.steps == 1 else f"{stage.steps} steps"
-    cost = f" by {steps} in {stage.seconds:.1f} s" + (", interrupted" if stage.interrupted else "")
-    cost = cost if stage.name == "repair" else ""
-    if stage.reason is None:
-        return f"{done}{cost}: {figures}"
-    reasons = {
-        Reason.NO_GAIN: "it does not help",
-        Reason.SMALL_GAIN: f"it {_TOO_LITTLE}",
-        Reason.MOST_VIEWS: "it is farther in most views",
-        Reason.OTHER_SIZES: "it harms pictures of another size",
-    }
-    if stage.name == "refine" and after.errors == before.errors:
-        return f"not {done}, it changes nothing: {before.psnr:.1f} dB PSNR against the dense scene ({before.where})"
-    return f"not {done}{cost}, {reasons[stage.reason]}: {figures}"
-
-
-_TOO_LITTLE = f"brings less than {ACCEPTANCE.min_gain:g} dB"
-
-
-def _photo_line(stage: Stage, trained: PhotoRepaired) -> str:
-    cost = f"on {trained.used} photos by {trained.steps} steps in {trained.seconds:.1f} s"
-    cost += ", interrupted" if trained.interrupted else ""
-    gain = f"{trained.before:.1f} -> {trained.after:.1f} dB PSNR in {trained.compared} photos"
-    if stage.accepted:
-        return f"trained {cost}: {gain}"
-    why = f"other photos lose {trained.lost:.1f} dB" if stage.reason is Reason.NO_GAIN else f"it {_TOO_LITTLE}"
-    return f"not trained {cost}, {why}: {gain}"
-
-
-def _uncompared(result: Compacted) -> str:
-    return f"it cannot be compared with the dense scene ({result.uncompared})"
+        done += f" on {stage.photos.used} photos"
+        figures = f"{stage.photos.before:.1f} -> {stage.photos.after:.1f} dB PSNR in {stage.photos.compared} photos"
+    else:
+        figures = "" if stage.before is None or stage.after is None else _figures(stage.before, stage.after)
+    reason = f", {stage.reason}" if stage.reason and figures else stage.reason and f": {stage.reason}"
+    return f"{'' if stage.accepted else 'not '}{done}{cost}{reason}" + (f": {figures}" if figures else "")
 
 
 def _figures(before: Closeness, after: Closeness) -> str:

@@ -33,9 +33,6 @@ class RepairSettings:
     last_factor: float = 0.02
     """Factor on the learning rates at the last step, see :func:`~pointsplat_ns.compression.repair.rate_factor`."""
 
-    pictures_kept: int = 256
-    """Largest number of renders of the dense scene in memory, of 0.7 MB each where pictures are 16 to 9."""
-
 
 REPAIR = RepairSettings()
 

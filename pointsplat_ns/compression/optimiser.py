@@ -181,13 +181,11 @@ def gradients_of(
     with torch.enable_grad():
         image = render(leaves, view, backend=backend)
         _loss(*Example(view, target, mask).compared(image)).backward()
-    return {name: _finite_gradient(value) for name, value in leaves.items()}
-
-
-def _finite_gradient(value: Tensor) -> Tensor:
-    if value.grad is None:
-        return torch.zeros_like(value)
-    return value.grad.nan_to_num_(0.0, 0.0, 0.0).masked_fill_(~value.detach().isfinite(), 0.0)
+    gradients = {}
+    for name, value in leaves.items():
+        gradient = torch.zeros_like(value) if value.grad is None else value.grad
+        gradients[name] = gradient.nan_to_num_(0.0, 0.0, 0.0).masked_fill_(~value.detach().isfinite(), 0.0)
+    return gradients
 
 
 def nonzero_rms(gradient: Tensor) -> float:

@@ -111,18 +111,14 @@ def photo_repair(
     """
     if len(photos) < 2:
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
-    run, last = OptimisationRun(budget), scene
+    run = OptimisationRun(budget)
     unseen = list(range(0, len(photos), 8))
     used = sorted({*range(len(photos))} - {*unseen})
     compared = [used[place] for place in spread_indices(len(used), VIEW_COUNTS.compared)]
     others = [unseen[place] for place in spread_indices(len(unseen), VIEW_COUNTS.compared // 2)]
     before, known = mean_psnr(scene, photos, compared), mean_psnr(scene, photos, others)
 
-    def keep(after: Gaussians) -> None:
-        nonlocal last
-        last = after
-
-    run.take(_scenes(scene, _examples(photos, used, dense, views), views, run), keep, progress)
+    last = run.take(scene, _scenes(scene, _examples(photos, used, dense, views), views, run), progress)
     after, lost = mean_psnr(last, photos, compared), known - mean_psnr(last, photos, others)
     counts = (len(used), len(compared), run.count)
     return PhotoRepaired(last, before, after, lost, *counts, run.seconds, run.interrupted)

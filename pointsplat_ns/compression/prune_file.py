@@ -62,7 +62,8 @@ def rows_to_prune(scene: Path, request: PruneRequest, memory: float | None = Non
     """
     import psutil
 
-    rows = _binary_ply(scene)
+    kind = format_to_read(scene) if scene.is_file() else None
+    rows = PlyRows.open(scene, warn=False) if kind is not None and kind.read is read_ply else None
     if rows is None:
         if memory is not None:
             raise SceneError(
@@ -110,9 +111,7 @@ def prune_file(
         request: options of pruning.
         memory: bytes that may be taken; more than the largest cell takes change nothing.
         poses: a file of cameras; by default views are sampled.
-        resolution: width and height of views, pixels.
-        up: which way is up, for sampled views; by default what the scene declares, or estimated.
-        progress: called with what is being done, and the share done of it.
+        resolution, up: as of :class:`~pointsplat_ns.looking.view_source.ViewSource`.
         jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:
@@ -134,7 +133,15 @@ def prune_file(
     if request.sh.isdigit():
         rows = copy.copy(rows)
         rows.rest = min(rows.rest, (int(request.sh) + 1) ** 2 - 1)
-    most = _most_in_cell(rows, memory)
+    most = MEMORY.most
+    if memory is not None:
+        each = _row_bytes(rows) + MEMORY.cell
+        needed = MEMORY.base + MEMORY.least * each
+        if memory < needed:
+            raise PointSplatError(
+                f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(needed)}"
+            )
+        most = min(most, int((memory - MEMORY.base) / each))
     given = None if poses is None or without_poses(poses) else poses
     file = None if given is None else PosesFile.of(rows.path, given).relative_to(rows.traits.offset)
     known = None if file is None else file.views
@@ -167,29 +174,8 @@ def prune_file(
     return before, time.perf_counter() - start
 
 
-def _binary_ply(scene: Path) -> PlyRows | None:
-    """The rows of a binary 3DGS PLY; None for any other scene."""
-    if not scene.is_file():
-        return None
-    kind = format_to_read(scene)
-    if kind is None or kind.read is not read_ply:
-        return None
-    return PlyRows.open(scene, warn=False)
-
-
 def _row_bytes(rows: PlyRows) -> int:
     return 4 * (14 + 3 * rows.rest)
-
-
-def _most_in_cell(rows: PlyRows, memory: float | None) -> int:
-    """Largest number of Gaussians in a cell. Raises PointSplatError if the memory is too small."""
-    if memory is None:
-        return MEMORY.most
-    each = _row_bytes(rows) + MEMORY.cell
-    needed = MEMORY.base + MEMORY.least * each
-    if memory < needed:
-        raise PointSplatError(f"memory of {bytes_text(memory)} is too small; expected at least {bytes_text(needed)}")
-    return min(MEMORY.most, int((memory - MEMORY.base) / each))
 
 
 def _digest(views: Views | None) -> str:

@@ -198,17 +198,9 @@ class Judge:
         return scene.at_offset(self.dense.offset).to(self.dense.device)
 
 
-def quality_of_file(
-    dense: Gaussians, source: ViewSource, scene: Gaussians, path: Path | None, suffix: str
-) -> Quality | None:
-    """The quality of a scene as it is in the file that it was written to, or for None as it would be in a file of a
-    suffix; None if there is no place to look from."""
-    judge = judge_of(dense, source)
-    if judge is None:
-        return None
-    return judge.quality(
-        through_file(scene, suffix)[1] if path is None else read_back(scene, path, format_to_write(path))
-    )
+def quality_of_file(judge: Judge | None, scene: Gaussians, path: Path) -> Quality | None:
+    """The quality of a scene as it is in the file that it was written to; None without a judge."""
+    return None if judge is None else judge.quality(read_back(scene, path, format_to_write(path)))
 
 
 def judge_of(dense: Gaussians, source: ViewSource) -> Judge | None:

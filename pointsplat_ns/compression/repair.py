@@ -74,21 +74,17 @@ def repair(
     def choose(scene: Gaussians) -> tuple[float, Tensor | None]:
         factors = None
         if network is not None:
-            expected = budget.steps_in_all(run.count, run.done) or REPAIR.most_steps
+            if budget.seconds is None:
+                expected = budget.steps
+            else:
+                expected = round(run.count / run.done) if run.done else REPAIR.most_steps
             with torch.no_grad(), one_thread():  # the same rounding for any number of threads
                 factors = network(feedback.features(scene, run.done, expected))
         return first_factor * rate_factor(run.done), factors
 
-    def keep(after: Gaussians) -> None:
-        nonlocal scene
-        scene = after
-
-    run.take(
-        optimised(scene, feedback, _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped)), choose),
-        keep,
-        progress,
-    )
-    return Repaired(scene, run.count, run.seconds, run.interrupted)
+    examples = _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped))
+    last = run.take(scene, optimised(scene, feedback, examples, choose), progress)
+    return Repaired(last, run.count, run.seconds, run.interrupted)
 
 
 @dataclass
@@ -111,16 +107,13 @@ class OptimisationRun:
         return time.perf_counter() - self._start
 
     def take(
-        self,
-        scenes: Iterator[Gaussians],
-        each: Callable[[Gaussians], None],
-        progress: Callable[[float], None] | None = None,
-    ) -> None:
-        """Take steps until the budget is used, or Ctrl-C.
+        self, scene: Gaussians, scenes: Iterator[Gaussians], progress: Callable[[float], None] | None = None
+    ) -> Gaussians:
+        """The scene after the last step: take steps until the budget is used, or Ctrl-C.
 
         Args:
+            scene: the scene before the first step.
             scenes: the scene after each step, without end.
-            each: called with it.
             progress: called with the share done, in [0, 1].
         """
         try:
@@ -128,18 +121,18 @@ class OptimisationRun:
                 scene = next(scenes)
                 self.count += 1
                 self.done = self.budget.share_done(self.count, self.seconds)
-                each(scene)
                 if progress is not None:
                     progress(min(self.done, 1.0))
         except KeyboardInterrupt:
             self.interrupted = True
+        return scene
 
 
 def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:
     """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end. A view that comes
-    again is not drawn again, as long as it is among the last ``REPAIR.pictures_kept``."""
+    again is not drawn again, as long as it is among the last 256."""
 
-    @functools.lru_cache(maxsize=REPAIR.pictures_kept)
+    @functools.lru_cache(maxsize=256)  # of 0.7 MB each where pictures are 16 to 9
     def drawn(view: View) -> Tensor:
         with torch.no_grad():
             return render(dense, view)

@@ -13,6 +13,7 @@ from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
 from pointsplat_ns.pruning import (
     Keep,
     Method,
+    PruneSettings,
     found_by_trying,
     method_named,
     parse_keep,
@@ -21,9 +22,6 @@ from pointsplat_ns.pruning import (
 
 if TYPE_CHECKING:
     from pointsplat_ns.compression.trained_refiner import TrainedRefiner
-
-SH_CHOICES = ("all", "auto", "0", "1", "2", "3")
-"""Values of the option ``sh``."""
 
 Effort = Literal["instant", "quick", "thorough"]
 
@@ -86,13 +84,6 @@ class RepairBudget:
         not be empty."""
         return seconds / self.seconds if self.seconds is not None else steps / self.steps
 
-    def steps_in_all(self, steps: int, done: float) -> int | None:
-        """Expected number of steps in the budget, if ``steps`` steps used the share ``done`` of it; None before the
-        first step of a budget in seconds."""
-        if self.seconds is None:
-            return self.steps
-        return round(steps / done) if done else None
-
 
 @dataclass(frozen=True)
 class PhotoBudget(RepairBudget):
@@ -138,7 +129,7 @@ class PruneRequest:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "method", method_named(self.by, self.opacity_weight))
-        if self.sh not in SH_CHOICES:
+        if self.sh not in ("all", "auto", "0", "1", "2", "3"):
             raise PointSplatError(f"sh is {self.sh!r}; expected all, auto or a degree from 0 to 3")
         budget = parse_keep(self.keep, self.suffix) if isinstance(self.keep, str) else self.keep
         object.__setattr__(self, "budget", budget)
@@ -186,21 +177,14 @@ class CompactRequest:
         if target_db is not None and (photos or keep is not None):
             other = "photos, which may differ from renders" if photos else "a budget"
             raise BudgetError(f"--target-db finds a size by renders of the dense scene; expected it without {other}")
-        usual_keep, usual_by, weight = 0.1, "merge", None
-        if refiner is not None:
-            usual_keep, usual_by, weight = refiner.settings.keep, refiner.settings.by, refiner.settings.opacity_weight
-        by = usual_by if by is None else by
-        weight = weight if method_named(by).weighs_opacity else None
-        prune = PruneRequest(usual_keep if keep is None else keep, by, sh, weight, clean, suffix)
+        usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
+        by = usual.by if by is None else by
+        weight = usual.opacity_weight if method_named(by).weighs_opacity else None
+        prune = PruneRequest(usual.keep if keep is None else keep, by, sh, weight, clean, suffix)
         if not photos:
             return cls(prune, refiner, repair, target_db=target_db)
         trained = PhotoBudget(repair.effort, repair.seconds)
         return cls(prune, refiner, repair if repair.seconds is None else RepairBudget(), trained)
-
-    @property
-    def device(self) -> torch.device:
-        """The device that renders: the refiner's, or the default one."""
-        return default_device() if self.refiner is None else self.refiner.device
 
     def check_sh_degree(self, dense: Gaussians) -> None:
         """Raise a SceneError, before the long computations, if the SH degree after pruning is certain to exceed the

@@ -61,7 +61,7 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
 
     Args:
         path: a ``.safetensors`` file, or a ``pointsplat`` run (its folder, ``config.yml`` or checkpoint); by default
-            the shipped refiner (``pointsplat_ns/refiner/pretrained/CARD.md`` describes its training).
+            or for "shipped" the one that ships (``pointsplat_ns/refiner/pretrained/CARD.md`` describes its training).
         device: device of the network; by default CUDA if available, else the CPU.
 
     Raises:
@@ -75,17 +75,24 @@ def load_refiner(path: Path | str | None = None, device: torch.device | str | No
         500
     """
     device = default_device() if device is None else device
-    if path is None and not SHIPPED_REFINER.is_file():
+    shipped = path is None or str(path) == "shipped"
+    if shipped and not SHIPPED_REFINER.is_file():
         raise WeightsError(
             f"{SHIPPED_REFINER}: the refiner that ships is not there; install the package again, or name another "
             "(--refiner RUN_OR_FILE)"
         )
-    path = SHIPPED_REFINER if path is None else Path(path)
+    path = SHIPPED_REFINER if path is None or shipped else Path(path)
     kind = path.suffix.lower()
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise WeightsError(f"{path}: not a regular file; expected a trained pointsplat run or a .safetensors file")
     if kind == ".safetensors":
-        network, settings = read_refiner(path), _settings_of_file(path)
+        network, metadata = read_refiner(path), read_metadata(path)
+        try:
+            settings = settings_from({"keep": 0.1, "by": "merge", **metadata})
+        except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
+            raise WeightsError(
+                f"{path}: metadata not understood ({one_line(error)}); train or download it again"
+            ) from error
     elif path.is_file() and kind not in (".yml", ".yaml", ".ckpt"):
         raise WeightsError(
             f"{path}: a {kind or 'nameless'} file; expected a trained pointsplat run (its folder or config.yml), or a "
@@ -119,17 +126,6 @@ def refine(scene: Gaussians, refiner: TrainedRefiner | None = None) -> Gaussians
         True
     """
     return (refiner or load_refiner())(scene)
-
-
-SHIPPED = "shipped"
-"""Name of the shipped refiner, in place of a path."""
-
-
-def refiner_at(path: Path | str | None, device: torch.device | str | None = None) -> TrainedRefiner | None:
-    """The trained refiner at a path as for :func:`load_refiner`, or at :data:`SHIPPED`; None for None."""
-    if path is None:
-        return None
-    return load_refiner(None if str(path) == SHIPPED else path, device)
 
 
 def open_refiner_run(path: Path | str, need_data: bool, data: Path | str | None = None) -> Run:
@@ -191,14 +187,3 @@ def _read_run(run: Run) -> tuple[Refiner, PruneSettings]:
         text = " ".join(str(error).split())[:160]
         raise SceneError(f"{run.checkpoint}: not a usable {METHOD_NAMES.refiner} checkpoint ({text})") from error
     return network, settings
-
-
-def _settings_of_file(path: Path) -> PruneSettings:
-    """Pruning settings from the metadata of a file of weights."""
-    metadata = read_metadata(path)
-    try:
-        return settings_from({"keep": 0.1, "by": "merge", **metadata})
-    except (PointSplatError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WeightsError(
-            f"{path}: metadata not understood ({one_line(error)}); train or download it again"
-        ) from error

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from pointsplat_ns.comparing.closeness import Reference
 from pointsplat_ns.gaussians import Gaussians
@@ -26,7 +26,7 @@ def pixel_sizes(
         dense: the scene that the levels were made of.
         reference: its renders.
         levels: their scenes.
-        near: PSNR in dB of each in the views that every command judges in.
+        near: PSNR of each in the views that every command judges in, dB.
     """
     distance = median_depth(dense, reference)
     if distance is None:
@@ -71,14 +71,9 @@ def far_references(reference: Reference) -> dict[int, Reference]:
             continue
         shrink = views.Ks.new_tensor([[1 / times], [1 / times], [1.0]])
         smaller = replace(views, Ks=views.Ks * shrink, width=views.width // times, height=views.height // times)
-        targets = [_averaged(image, times) for image in reference.renders]
+        targets = [avg_pool2d(image.double().permute(2, 0, 1), times).permute(1, 2, 0) for image in reference.renders]
         found[times] = Reference(smaller, targets, reference.covered)
     return found
-
-
-def _averaged(image: Tensor, side: int) -> Tensor:
-    """Means (H // side, W // side, 3), float64, of squares of ``side`` pixels of an image (H, W, 3)."""
-    return torch.nn.functional.avg_pool2d(image.double().permute(2, 0, 1), side).permute(1, 2, 0)
 
 
 @torch.no_grad()

@@ -9,9 +9,9 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -20,23 +20,25 @@ from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, Quality
 from pointsplat_ns.compression.requests import PruneRequest
-from pointsplat_ns.errors import BudgetError, DataError
-from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
+from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
+from pointsplat_ns.gaussians import Gaussians, Traits
+from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.holding import typical_sizes
+from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
+from pointsplat_ns.io.outputs import need_folder, need_writable
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import pixel_sizes
-from pointsplat_ns.levels.folder import write_levels
+from pointsplat_ns.levels.folder import check_folder, level_names, write_levels
 from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
-from pointsplat_ns.levels.tiles import placed, write_tiles
+from pointsplat_ns.levels.tiles import TILESET, placed, write_tiles
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
-from pointsplat_ns.pruning import Keep, Megabytes, WithinPsnr, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.system.progress import Progress, silent
-
-DEFAULT_LEVELS = ("50%", "25%", "10%", "3%")
+from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
+from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.views import Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +88,10 @@ class Levels:
     """The N Gaussians of the dense scene with all SH bands, without undrawable ones."""
     levels: tuple[Level, ...]
     """The finest first."""
-    reference: DenseReference | None
-    """Renders of the dense scene, for comparison with the levels; None if there are no views."""
+    views: Views | None
+    """The views that tell from which distance on a level shows enough; None if there are none."""
     origin: str
-    """Origin of those views."""
+    """Origin of the views."""
     source: SourceFile | None
     """The file of the dense scene; None if it was given as Gaussians."""
     notes: tuple[str, ...]
@@ -133,56 +135,12 @@ class Levels:
         Raises:
             SceneError: if the folder cannot be used, or holds a file that must not be overwritten.
         """
-        write_levels(folder, self.scenes, *self._manifest(), force)
-
-    def save_stream(self, folder: str | Path, force: bool = False, progress: Progress = silent) -> list[int]:
-        """Write the levels as a streamed SOG, as ``pointsplat lod --stream`` does; see
-        :func:`~pointsplat_ns.levels.stream.write_stream`. Returns the number of Gaussians of each."""
-        return write_stream(folder, self.scenes, self.parents, force, progress)
-
-    def save_paged(self, path: str | Path, progress: Progress = silent) -> int:
-        """Write the levels as a RAD file, as ``pointsplat lod -o room.rad`` does; see
-        :func:`~pointsplat_ns.levels.paged.write_paged`. Returns the number of its Gaussians."""
-        return write_paged(path, self.scenes, self.parents, progress)
-
-    def save_tiles(
-        self,
-        folder: str | Path,
-        at: str | None = None,
-        up: str | None = None,
-        force: bool = False,
-        progress: Progress = silent,
-    ) -> list[int]:
-        """Write the levels as 3D Tiles, as ``pointsplat lod --tiles`` does; see
-        :func:`~pointsplat_ns.levels.tiles.write_tiles`. Returns the number of Gaussians of each.
-
-        Args:
-            folder: created if it is missing.
-            at: where the scene lies on the Earth, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; by default the
-                tiles have the frame of the scene's file.
-            up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
-            force, progress: as for :meth:`save_stream`.
-        """
-        about, matrix = placed(self.scenes, self.dense, at, up)
-        return write_tiles(
-            folder, about, [of.cpu() for of in self.parents], self._pixel_sizes(), matrix, force, progress
-        )
-
-    def _pixel_sizes(self) -> list[float]:
-        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
-        Gaussians."""
-        near = [level.quality.psnr for level in self if level.quality is not None]
-        found = None if self.reference is None else pixel_sizes(self.dense, self.reference, self.scenes, near)
-        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
-
-    def _manifest(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """The manifest's facts on all levels together, and on each."""
-        dense, file, views = self.dense, self.source, None
+        dense, file, of = self.dense, self.source, self.views
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
         if bool((dense.alphas > 0).any()):
             boxes["content"] = content_box(dense)
-        if self.reference is not None:
-            of = self.reference.views
+        views = None
+        if of is not None:
             views = {"count": len(of), "origin": self.origin, "width": of.width, "height": of.height}
         source = {
             "file": file and file.name,
@@ -192,7 +150,73 @@ class Levels:
             "sh_degree": dense.sh_degree,
         }
         bounds = {name: {"min": low.tolist(), "max": high.tolist()} for name, (low, high) in boxes.items()}
-        return {"source": source, "bounds": bounds, "views": views}, [level.facts(len(dense)) for level in self]
+        about = {"source": source, "bounds": bounds, "views": views}
+        write_levels(folder, self.scenes, about, [level.facts(len(dense)) for level in self], force)
+
+    def pixel_sizes(self) -> list[float]:
+        """Scene units a pixel from which on each level shows enough; without views, the typical size of its
+        Gaussians."""
+        near, found = [level.quality.psnr for level in self if level.quality is not None], None
+        if self.views is not None:
+            found = pixel_sizes(self.dense, DenseReference(self.dense, self.views), self.scenes, near)
+        return found or [float(typical_sizes(scene.to("cpu")).median()) for scene in self.scenes]
+
+
+@dataclass(frozen=True)
+class LevelOutput:
+    """Where levels are written, and in which form. Raises PointSplatError if options do not fit each other."""
+
+    path: Path
+    """A folder; of the form "paged" a file."""
+    form: Literal["folder", "stream", "tiles", "paged"]
+    """A folder with a file for each level, a streamed SOG, 3D Tiles, or a RAD file."""
+    at: str | None
+    """Where the scene lies on the Earth, for tiles."""
+    up: str | None
+    force: bool
+
+    @classmethod
+    def of(
+        cls, path: str | Path | None, stream: bool, tiles: bool, at: str | None, up: str | None, force: bool
+    ) -> LevelOutput | None:
+        """The output of options of :func:`pointsplat_ns.lod`; None if nothing is written."""
+        if stream and tiles or at is not None and not tiles:
+            raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
+        if at is not None:
+            Place.parse(at)
+        if path is None:
+            return None
+        paged = Path(path).suffix.lower() == ".rad"
+        return cls(
+            Path(path), "stream" if stream else "tiles" if tiles else "paged" if paged else "folder", at, up, force
+        )
+
+    def check(self, count: int) -> None:
+        """Check that ``count`` levels can be written."""
+        if self.form == "paged":
+            return need_writable(self.path, self.force)
+        names = {"folder": level_names(count), "tiles": [TILESET], "stream": [STREAM_META]}[self.form]
+        check_folder(self.path, names, self.force)
+        need_folder(self.path)
+
+    def write(self, levels: Levels, progress: Progress) -> Levels:
+        """Write levels; those of a stream are then judged as they are in its files."""
+        self.check(len(levels))  # again: a file may have appeared meanwhile
+        if self.form == "folder":
+            levels.save(self.path, self.force)
+        elif self.form == "paged":
+            write_paged(self.path, levels.scenes, levels.parents, progress)
+        elif self.form == "tiles":
+            about, matrix = placed(levels.scenes, levels.dense, self.at, self.up)
+            parents = [of.cpu() for of in levels.parents]
+            write_tiles(self.path, about, parents, levels.pixel_sizes(), matrix, progress)
+        else:
+            write_stream(self.path, levels.scenes, levels.parents, progress)
+            if levels.judge is not None:
+                read = [levels.judge.quality(read_sog_stream(self.path, index)) for index in range(len(levels))]
+                judged = (replace(level, quality=quality) for level, quality in zip(levels, read, strict=True))
+                return replace(levels, levels=tuple(judged))
+        return levels
 
 
 def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
@@ -204,7 +228,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
         raise BudgetError("no level given; expected at least one, such as 50%")
     parsed: list[tuple[str, Keep]] = []
     for level in levels:
-        text = level if isinstance(level, str) else _text(level)
+        text = str(level)
         try:
             budget = parse_keep(level) if isinstance(level, str) else level
         except BudgetError as error:
@@ -217,11 +241,7 @@ def parse_levels(levels: Sequence[Keep | str] | str) -> list[tuple[str, Keep]]:
     return parsed
 
 
-def _text(level: Keep) -> str:
-    return str(level) if isinstance(level, (Megabytes, WithinPsnr)) else repr(level)
-
-
-def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits = PLAIN) -> list[int]:
+def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits: Traits) -> list[int]:
     """The number of Gaussians of each level of a scene of ``n``, descending. Raises BudgetError if a level does not fit
     the scene, or two levels have the same number."""
     texts: dict[int, str] = {}
@@ -238,39 +258,35 @@ def level_counts(levels: list[tuple[str, Keep]], n: int, sh_degree: int, traits:
 
 def make_levels(
     dense: Gaussians,
-    levels: Sequence[Keep | str] | str = DEFAULT_LEVELS,
-    sh: str = "all",
-    views: ViewSource | None = None,
-    source: SourceFile | None = None,
-    progress: Progress = silent,
+    levels: list[tuple[str, Keep]],
+    request: PruneRequest,
+    views: ViewSource,
+    source: SourceFile | None,
+    progress: Progress,
 ) -> Levels:
     """Make levels of detail in one pass, and measure each level as soon as it is made.
 
     Args:
         dense: N Gaussians. Undrawable ones are left out first, and their number is logged.
-        levels: see :func:`parse_levels`; in any order.
-        sh: SH bands of every level, as for :class:`~pointsplat_ns.compression.requests.PruneRequest`.
-        views: source of the views to compare renders in; merging uses them too where they are known. By default views
-            are sampled.
+        levels: of :func:`parse_levels`; in any order.
+        request: for all Gaussians; its SH bands are those of every level.
+        views: source of the views to compare renders in; merging uses them too where they are known.
         source: the file of ``dense``, for the manifest.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn.
-        DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown.
+        DataError: if the SH bands need views and there are none.
     """
-    budgets = parse_levels(levels)
     need_usable(dense)
     dense = keep_usable(dense, "the dense scene")
-    views = views or ViewSource(dense)
     progress("rendering the dense scene", 0.0)
-    cut = prune_scene(dense, PruneRequest(1.0, sh=sh), views)
-    counts = level_counts(budgets, len(dense), cut.scene.sh_degree, dense.traits)
-    notes, reference, judge = cut.notes, None, None
+    cut = prune_scene(dense, request, views)
+    counts = level_counts(levels, len(dense), cut.scene.sh_degree, dense.traits)
+    notes, compared, judge = cut.notes, None, None
     try:
-        judge, reference = Judge(dense, views), DenseReference(dense, views.compared())
+        judge, compared = Judge(dense, views), views.compared()
     except DataError as error:
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.text not in notes:
@@ -280,14 +296,8 @@ def make_levels(
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         seconds = time.perf_counter() - start
         progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
-        made.append(
-            Level(
-                scene=merged.scene,
-                assignment=merged.assignment,
-                dropped=int((merged.assignment < 0).sum()),
-                quality=None if judge is None else judge.quality(merged.scene),
-                seconds=seconds,
-            )
-        )
+        quality = None if judge is None else judge.quality(merged.scene)
+        dropped = int((merged.assignment < 0).sum())
+        made.append(Level(merged.scene, merged.assignment, dropped, quality, seconds))
         start = time.perf_counter()
-    return Levels(dense, tuple(made), reference, views.origin, source, notes, judge)
+    return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)

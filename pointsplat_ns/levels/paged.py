@@ -27,10 +27,7 @@ def write_paged(
 
     Args:
         path: the file.
-        levels: the finest first.
-        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
-            that are too faint to be drawn, which are left out.
-        progress: called while encoding.
+        levels, parents, progress: as of :func:`~pointsplat_ns.levels.tiles.write_tiles`.
 
     Returns:
         The number of Gaussians written.

@@ -16,7 +16,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import STREAM_META, format_to_write
 from pointsplat_ns.io.formats.sog_stream import Node, write_sog_stream
 from pointsplat_ns.io.scene import warn_of_losses
-from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.levels.tree import Parts, grouped, halved, leaves
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.system.progress import Progress, silent
@@ -24,33 +23,22 @@ from pointsplat_ns.system.tensors import INDICES
 
 
 def write_stream(
-    folder: Path | str,
-    levels: Sequence[Gaussians],
-    parents: Sequence[Tensor],
-    force: bool = False,
-    progress: Progress = silent,
+    folder: Path, levels: Sequence[Gaussians], parents: Sequence[Tensor], progress: Progress = silent
 ) -> list[int]:
-    """Write levels of detail as a streamed SOG.
+    """Write levels of detail as a streamed SOG, over an older one.
 
     Args:
         folder: created if it is missing.
-        levels: the finest first.
-        parents: for each level but the last, the index (M,) in the next of the parent of each Gaussian; -1 for those
-            that are too faint to be drawn, which are left out.
-        force: whether an existing stream may be overwritten.
-        progress: called while encoding.
+        levels, parents, progress: as of :func:`~pointsplat_ns.levels.tiles.write_tiles`.
 
     Returns:
         The number of Gaussians written of each level.
 
     Raises:
-        SceneError: if the folder cannot be used, or a file cannot be written.
+        SceneError: if a file cannot be written.
     """
-    folder = Path(folder)
-    check_folder(folder, (STREAM_META,), force)
     scenes = [level.detach().to("cpu", torch.float32) for level in levels]
-    if scenes:
-        warn_of_losses(format_to_write(".sog"), scenes[0], folder)
+    warn_of_losses(format_to_write(".sog"), scenes[0], folder)
     most = 1 << 19
     tree = partition(scenes, [of.cpu().long() for of in parents], most)
     return write_sog_stream(scenes, tree, folder / STREAM_META, most, progress)["counts"]

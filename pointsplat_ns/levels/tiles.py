@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from pointsplat_ns.io.formats.glb_tile import TILE_EXTENSIONS, encode_tile
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.offsets import from_centre
 from pointsplat_ns.io.scene import warn_of_losses
-from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.levels.tree import Cell, cells
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import known_up, up_named
@@ -30,9 +29,6 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 TILESET = "tileset.json"
 """The file that tells of all others."""
-
-PIXELS = 16.0
-"""Pixels of error at which CesiumJS refines a tile, unless it is told another number."""
 
 
 def placed(
@@ -63,12 +59,11 @@ def placed(
 
 
 def write_tiles(
-    folder: Path | str,
+    folder: Path,
     levels: Sequence[Gaussians],
     parents: Sequence[Tensor],
     pixel_sizes: Sequence[float],
     matrix: Tensor,
-    force: bool = False,
     progress: Progress = silent,
     most: int = 1 << 16,
 ) -> list[int]:
@@ -83,7 +78,6 @@ def write_tiles(
             that are too faint to be drawn, which are left out.
         pixel_sizes: of each level, scene units a pixel from which on it shows enough.
         matrix: (4, 4) float64, from the levels' frame to that of the tiles.
-        force: whether existing tiles may be overwritten.
         progress: called while encoding.
         most: Gaussians in a tile, but for children of one parent.
 
@@ -91,19 +85,17 @@ def write_tiles(
         The number of Gaussians written of each level.
 
     Raises:
-        SceneError: if the folder cannot be used, or a file cannot be written.
+        SceneError: if a file cannot be written.
     """
-    folder = Path(folder)
-    check_folder(folder, (TILESET,), force)
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
-    count = sum(1 for top in tops for _ in _all(top))
-    errors = [PIXELS * size for size in itertools.accumulate(pixel_sizes, max)]
+    # CesiumJS refines a tile at an error of 16 pixels, unless it is told another number
+    errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
     counts, number = [0] * len(levels), itertools.count()
 
     def tile(cell: Cell) -> dict[str, Any]:
         scene, index = levels[cell.level][cell.rows], next(number)
-        progress(f"tile {index + 1} of {count}", index / count)
+        progress("writing tiles", sum(counts) / sum(map(len, levels)))
         low, high = _box(scene)
         x, y, z = (0.5 * (low + high)).tolist()
         name = f"tiles/{cell.level}_{index}.glb"
@@ -129,12 +121,6 @@ def write_tiles(
         part.write_text(json.dumps(tileset, separators=(",", ":")), "utf-8")
         (folder / TILESET).unlink(missing_ok=True)
     return counts
-
-
-def _all(cell: Cell) -> Iterator[Cell]:
-    yield cell
-    for child in cell.children:
-        yield from _all(child)
 
 
 def _box(scene: Gaussians) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 The basis is orthonormal on the sphere: the mean square, over all directions, of a coefficient's contribution to a
 colour is its square divided by 4 pi, and dropping coefficients is the best approximation by the others. So the energy
 lost is known without rendering. The visible error is not: a scene is seen from some directions only, and errors of real
-scenes were up to 9 dB away from the energy's prediction. So :mod:`~pointsplat_ns.compression.budget_search` renders to
+scenes were up to 9 dB away from the energy's prediction. So :mod:`~pointsplat_ns.compression.prune` renders to
 decide which degree to keep.
 """
 

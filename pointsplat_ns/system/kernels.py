@@ -17,6 +17,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -126,27 +127,16 @@ SEVERAL = 4000
 """Gaussians, or pairs of Gaussian and tile, from which on several threads are faster than one."""
 
 
-_LIBRARY = library_path()
-
-
-def _why_not_loaded() -> str:
-    """The reason why the library cannot be loaded; empty if it can."""
-    if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
-        return "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
-    if not _LIBRARY.is_file():
-        others = any(_LIBRARY.parent.glob("kernels.*.so"))
-        found = "they were built from other sources" if others else "they were not built"
-        return f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
-    try:
-        ctypes.CDLL(str(_LIBRARY))
-    except OSError as error:
-        return " ".join(str(error).split())
-    return ""
-
-
 class Kernels:
     """Functions of the C++ files that are faster than torch. All are used or none, because results would else be
-    rounded by the one here and by torch there."""
+    rounded by the one here and by torch there.
+
+    Args:
+        path: their library, which an installation builds.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
 
     @functools.cached_property
     def _text(self) -> str:
@@ -160,7 +150,7 @@ class Kernels:
     @functools.cached_property
     def library(self) -> ctypes.CDLL:
         """The functions. Raises OSError if they were not built."""
-        library = ctypes.CDLL(str(_LIBRARY))
+        library = ctypes.CDLL(str(self._path))
         for name, (result, parameters) in functions_of(self._text, self.structs).items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, parameters
@@ -169,9 +159,19 @@ class Kernels:
     @functools.cached_property
     def why_missing(self) -> str:
         """The reason why this machine cannot use them; empty if it can."""
-        why = _why_not_loaded()
-        if why:
-            logger.warning("compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why)
+        if IS_X86 and not torch.backends.cpu.get_cpu_capability().startswith("AVX"):  # AVX2 or more
+            why = "this processor, or ATEN_CPU_CAPABILITY, has no AVX2"
+        elif not self._path.is_file():
+            others = any(self._path.parent.glob("kernels.*.so"))
+            found = "they were built from other sources" if others else "they were not built"
+            why = f"{found}; where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
+        else:
+            try:
+                ctypes.CDLL(str(self._path))
+                return ""
+            except OSError as error:
+                why = " ".join(str(error).split())
+        logger.warning("compiled kernels are not used, torch computes all, slower, rounded otherwise: %s", why)
         return why
 
     def usable(self, wanted: bool | None) -> bool:
@@ -189,7 +189,7 @@ class Kernels:
         return suited and self.usable(wanted)
 
 
-KERNELS = Kernels()
+KERNELS = Kernels(library_path())
 
 
 @functools.cache

@@ -5,26 +5,25 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import sys
-from pathlib import Path
 
 
-def keep_freed_memory() -> bool:
-    """Let the process reuse freed memory instead of returning it to the system; whether the setting was made.
+def keep_freed_memory() -> None:
+    """Let the process reuse freed memory instead of returning it to the system.
 
     By default glibc maps a new block for every allocation above 32 MB, and the system then clears it page by page. When
     training on a CPU, each step frees and allocates the same large tensors, and this can take more time than the
     arithmetic. The price: the process never returns memory until it ends. Without Linux and glibc, nothing is changed.
     """
-    return _set({-4: 0, -1: -1})  # M_MMAP_MAX, M_TRIM_THRESHOLD
+    _set({-4: 0, -1: -1})  # M_MMAP_MAX, M_TRIM_THRESHOLD
 
 
-def share_freed_memory() -> bool:
-    """Let threads that come and go reuse the memory of one another; whether the setting was made.
+def share_freed_memory() -> None:
+    """Let threads that come and go reuse the memory of one another.
 
     By default glibc gives each new thread a place of its own to allocate from, up to eight for each core, and memory
     that was freed there serves no other. Threads that exist keep theirs. Without Linux and glibc, nothing is changed.
     """
-    return _set({-8: 2})  # M_ARENA_MAX: enough for a thread that draws and the others
+    _set({-8: 2})  # M_ARENA_MAX: enough for a thread that draws and the others
 
 
 def give_back_freed_memory() -> None:
@@ -34,42 +33,10 @@ def give_back_freed_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _set(values: dict[int, int]) -> bool:
-    """Set parameters of glibc's malloc by their numbers in mallopt(3); whether that was possible."""
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return False  # another C library
-    return all(bool(mallopt(name, value)) for name, value in values.items())
-
-
-class PeakMemory:
-    """The most memory that this process holds from here on, as Linux counts it (resident, freed memory given back
-    first).
-
-    Example:
-        >>> peak = PeakMemory()
-        >>> filled = bytearray(10**8)
-        >>> peak.bytes() is None or peak.bytes() >= 10**8
-        True
-    """
-
-    def __init__(self) -> None:
-        self._known = False
-        give_back_freed_memory()
-        try:
-            Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark to what is resident now
-            self._known = True
-        except (OSError, AttributeError, TypeError):
-            pass  # another system
-
-    def bytes(self) -> int | None:
-        """The peak so far; None where it cannot be known."""
-        if not self._known:
-            return None
-        for line in Path("/proc/self/status").read_text("utf-8").splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-        return None
+def _set(values: dict[int, int]) -> None:
+    """Set parameters of glibc's malloc by their numbers in mallopt(3), if that is possible."""
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            mallopt = ctypes.CDLL("libc.so.6").mallopt
+            for name, value in values.items():
+                mallopt(name, value)

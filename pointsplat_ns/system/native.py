@@ -9,7 +9,6 @@ import hashlib
 import platform
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1]
 INCLUDE = Path(__file__).with_name("include")
 """Folder of the headers that several files include."""
 
@@ -26,7 +25,7 @@ FLAGS = (
 
 def cpp_files(pattern: str = "*.cpp") -> list[Path]:
     """The C++ files of this package, or its headers, ``*.h``."""
-    return sorted(PACKAGE.rglob(pattern))
+    return sorted(Path(__file__).parents[1].rglob(pattern))
 
 
 def library_path() -> Path:
@@ -34,5 +33,6 @@ def library_path() -> Path:
     for it; the dot in it keeps Python from taking it for a module."""
     key = hashlib.sha256(" ".join((platform.system(), platform.machine(), *FLAGS)).encode())
     for path in (*cpp_files(), *cpp_files("*.h")):
-        key.update(f"\0{path.relative_to(PACKAGE).as_posix()}\0".encode() + path.read_bytes())
+        name = path.relative_to(Path(__file__).parents[1]).as_posix()
+        key.update(f"\0{name}\0".encode() + path.read_bytes())
     return Path(__file__).with_name(f"kernels.{key.hexdigest()[:16]}.so")

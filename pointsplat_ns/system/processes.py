@@ -31,12 +31,6 @@ def local_rank() -> int:
     return int(os.environ["LOCAL_RANK"]) if torchrun_rank()[1] > 1 else 0
 
 
-def torchrun_device() -> torch.device:
-    """The device of this process: of the GPUs the one that is its turn, if there are any."""
-    count = torch.cuda.device_count()
-    return torch.device("cuda", local_rank() % count) if count else torch.device("cpu")
-
-
 def connect_torchrun(backend: Literal["gloo", "nccl"] = "gloo") -> None:
     """Connect the processes that ``torchrun`` started together; does nothing in one alone, or a second time. The
     backend is nccl where each process has a GPU of its own."""

@@ -11,9 +11,6 @@ from typing import IO, Any, TypeVar
 Progress = Callable[[str, float], None]
 """Called with the name of the current task and the share of it that is done, in [0, 1]."""
 
-LINE_SECONDS = 30.0
-"""Seconds from one line to the next in a log. What is done sooner writes none."""
-
 Item = TypeVar("Item")
 
 
@@ -58,7 +55,7 @@ def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
 
 
 def _lines(stream: IO[str]) -> Progress:
-    """Writes what is being done to ``stream``, every :data:`LINE_SECONDS` seconds."""
+    """Writes what is being done to ``stream``, every 30 seconds."""
     start = written = time.monotonic()
     begun: dict[str, tuple[float, float]] = {}  # when each task was first heard of, and what was done of it by then
 
@@ -66,24 +63,15 @@ def _lines(stream: IO[str]) -> Progress:
         nonlocal written
         now = time.monotonic()
         start_of_task, before = begun.setdefault(what, (now, share))
-        if now - written < LINE_SECONDS:
+        if now - written < 30.0:
             return
-        written, left = now, _left(share, share - before, now - start_of_task)
+        written, gained, left = now, share - before, ""
+        if gained > 0 and share < 1:
+            left = f", about {_clock((now - start_of_task) * (1 - share) / gained)} left"
         with suppress(OSError, ValueError):  # nobody reads any more: the work goes on
             print(f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}", file=stream, flush=True)
 
     return show
-
-
-def _left(share: float, gained: float, taken: float) -> str:
-    """Time left of a task, in words, from the share that is done, and the part of it that took some seconds; empty if
-    nothing can be said.
-
-    Example:
-        >>> _left(0.25, 0.25, 30.0), _left(0.5, 0.0, 0.0), _left(1.0, 1.0, 30.0)
-        (', about 1:30 left', '', '')
-    """
-    return f", about {_clock(taken * (1 - share) / gained)} left" if gained > 0 and share < 1 else ""
 
 
 def _clock(seconds: float) -> str:

@@ -41,7 +41,7 @@ class Workers(Generic[Item, Result]):
             context = get_context("spawn")
             ends, self._held = context.Pipe(duplex=False)
             function = pickle.dumps(self._function)  # by multiprocessing, tensors would be moved to shared memory
-            with _started_safely(threads_for(self._jobs)):  # a pool starts multiprocessing's tracker of resources
+            with _started_safely(self._jobs):  # a pool starts multiprocessing's tracker of resources
                 self._pool = ProcessPoolExecutor(self._jobs, context, _begin, (ends, function))
         return self
 
@@ -58,7 +58,7 @@ class Workers(Generic[Item, Result]):
                 yield item, self._function(item)
             return
         try:
-            with _started_safely(threads_for(self._jobs)):
+            with _started_safely(self._jobs):
                 futures = {self._pool.submit(_call, item): item for item in items}
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -73,12 +73,6 @@ def check_jobs(jobs: int) -> None:
     """Raise a DataError if a number of processes is not positive."""
     if jobs < 1:
         raise DataError(f"jobs is {jobs}; expected 1 or more")
-
-
-def threads_for(jobs: int) -> int:
-    """Number of threads that each of several processes may use: what the environment variable ``OMP_NUM_THREADS`` says,
-    else its share of the cores."""
-    return torch.get_num_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
 
 
 _function: Callable[[], Callable[[Any], Any]]
@@ -103,13 +97,13 @@ def _end_with(ends: connection.Connection) -> None:
     os._exit(1)
 
 
-_STARTING = threading.Lock()
+_starting = threading.Lock()
 
 
 @contextmanager
-def _started_safely(threads: int) -> Iterator[None]:
-    """Let processes that are started while the context is open have so many threads, no Ctrl-C, and not the current
-    folder on their path.
+def _started_safely(jobs: int) -> Iterator[None]:
+    """Let processes that are started while the context is open have no Ctrl-C, not the current folder on their path,
+    and as many threads each as the environment variable ``OMP_NUM_THREADS`` says, else their share of the cores.
 
     multiprocessing starts them and its resource tracker with ``python -c``, which puts the current folder first on the
     path: what lies beside the scenes would be imported in place of Python's own modules. Python 3.10 has no option
@@ -126,7 +120,8 @@ def _started_safely(threads: int) -> Iterator[None]:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    with _STARTING, fixed_threads(threads):
+    threads = torch.get_num_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
+    with _starting, fixed_threads(threads):
         helpers: Any = util
         start = helpers.spawnv_passfds
         helpers.spawnv_passfds = start_safely

@@ -22,7 +22,6 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos, view_sourc
 from pointsplat_ns.photos.examples import Photos
 from pointsplat_ns.photos.posed_photos import read_with_photos
 from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
-from pointsplat_ns.system.memory import PeakMemory
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, Setting
 
@@ -111,15 +110,13 @@ class MadeScene(NamedTuple):
 
     scene: Gaussians
     seconds: float
-    peak_bytes: int | None
-    """Peak memory of this process while making it."""
 
 
 def make(subject: Subject, setting: Setting, progress: Progress) -> MadeScene:
     """Make the scene of a setting, from a new source of views, so that time and result equal the command's. Raises
     KeyboardInterrupt on Ctrl-C, also during a repair."""
     dense, views = subject.dense, subject.new_views()
-    peak, start = PeakMemory(), time.perf_counter()
+    start = time.perf_counter()
     if setting.repair == "none":
         scene = prune_scene(dense, PruneRequest(setting.count, setting.by), views, progress).scene
     else:
@@ -129,4 +126,4 @@ def make(subject: Subject, setting: Setting, progress: Progress) -> MadeScene:
         if compacted.interrupted:
             raise KeyboardInterrupt
         scene = compacted.scene
-    return MadeScene(scene.to(dense.device), time.perf_counter() - start, peak.bytes())
+    return MadeScene(scene.to(dense.device), time.perf_counter() - start)

@@ -143,7 +143,6 @@ class Measurer:
             frame_ms=self._dense_ms / speed.median,
             fill=quality.fill,
             seconds=made.seconds,
-            peak_bytes=made.peak_bytes,
             others_cores=others_cores,
         )
 

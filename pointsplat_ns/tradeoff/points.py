@@ -84,8 +84,6 @@ class Point:
     """Mean number of Gaussians that viewers draw on a pixel."""
     seconds: float
     """Duration of making the scene."""
-    peak_bytes: int | None = None
-    """Peak memory of the making process; None if it was not measured."""
     others_cores: float | None = None
     """Cores that other programs used during the timing; None if that is not known."""
 

@@ -118,7 +118,7 @@ def measure_tradeoff(
                     report(f"{name}: {what}", share)
 
                 dense = setting.by == DENSE
-                made = MadeScene(subject.dense, 0.0, None) if dense else make(subject, setting, show)
+                made = MadeScene(subject.dense, 0.0) if dense else make(subject, setting, show)
                 measuring.add(setting, made, show)
         except (KeyboardInterrupt, SystemExit):
             if measuring.points:

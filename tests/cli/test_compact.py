@@ -12,8 +12,8 @@ from refusing import refusal, run
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from html_parts import parts_of
-from making import ball, run_of, same
-from pointsplat_ns.cli.goals import GOALS
+from making import ball, same
+from pointsplat_ns.cli.compact import GOALS
 from pointsplat_ns.compression import pictures, quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, read_scene, write_ply
@@ -84,9 +84,6 @@ def test_a_page_to_fly_through_both_scenes_is_written(ply, helps, tmp_path, caps
     assert titles[0].splitlines()[2:] == files[:1]
     assert titles[-1].splitlines()[2:] == [files[1], *quality.split(": ")]
     assert flight["views"] == FlightFrame.of(read_scene(ply)).data([])["views"] and len(flight["views"]) == 6
-    run("compact", ply, "--refiner", helps, "--dry-run", "--html", shown, "--force")
-    names = [scene["name"] for scene in parts_of(shown).data["flight"]["scenes"]]
-    assert names == [f"dense ({files[0]})", "compact (not written)"]
 
 
 @pytest.mark.parametrize("goal", [name for name in GOALS if name])
@@ -135,20 +132,14 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
 
 
 def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
-    ply, helps, trained_walls, tmp_path, capsys, monkeypatch
+    ply, helps, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours
-    torn = tmp_path / "torn.safetensors"
-    torn.write_bytes(helps.read_bytes()[:1000])
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"
     for scene, options, wanted in (
-        (ply, ("--refiner", run_of(trained_walls, "wall-a")), "expected a pointsplat run"),
         (ply, ("--refiner", ply), "expected a trained pointsplat run"),
         (ply, ("-o", tmp_path / "small.obj"), ".spz, .sog"),
-        (ply, ("--refiner", torn), "torn.safetensors: not a readable"),
-        (ply, ("--refiner", tmp_path / "gone"), "no such file"),
-        (ply, ("--refiner", tmp_path / "gone.safetensors"), "no such file"),
         (ply, ("--refiner", tmp_path / "flat.safetensors"), "SH degree 1; the refiner"),
         (tmp_path / "gone.ply", ("--refiner", helps), "gone.ply: no such file"),
         (ply, ("--seconds", "-1"), "the time to repair is -1 s; expected 0 or more"),

@@ -69,7 +69,6 @@ def test_results_have_the_formats_of_their_scenes(folder, tmp_path, capsys):
     "words, said",
     [
         (("compact", "rooms", "--poses", "a.json"), "--poses is for one scene; rooms is a folder of scenes"),
-        (("compact", "rooms", "--dry-run"), "--dry-run is for one scene"),
         (("compact", "rooms", "-o", "rooms"), "rooms: holds the scenes themselves"),
         (("compact", "rooms/room1.ply", "--jobs", "2"), "one scene; --jobs is for a folder"),
         (("compact", "empty"), "empty: no scene below it"),

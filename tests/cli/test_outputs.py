@@ -14,7 +14,7 @@ from pointsplat_ns.compression import repair
 FAILING = (
     "prune damaged.ply -o OUT.ply",
     "compact damaged.ply -o OUT.spz",
-    "compact damaged.ply --dry-run --html OUT.html",
+    "compact damaged.ply -o small.ply --html OUT.html",
     "convert damaged.ply OUT.sog",
     "info damaged.ply --views OUT.png",
     "render damaged.ply -o OUT.mp4",

@@ -1,8 +1,11 @@
 """pointsplat prune and export: what they write, and what they say of input that cannot be used."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import psutil
@@ -11,11 +14,12 @@ import torch
 from refusing import refusal, run
 
 import pointsplat_ns as ps
-from making import ball, normal_scene, run_of, same
+from killing import KILLED_AFTER_STEPS
+from making import ball, normal_scene, quick_start, run_of
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.pruning import METHODS, prune
+from pointsplat_ns.pruning import METHODS
 from posing import inria, written
 
 SEED = 5
@@ -30,14 +34,6 @@ def ply(tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
     return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
-
-
-def test_prune_scores_as_it_is_told(ply, tmp_path):
-    run("prune", ply, "--keep", "9", "--by", "authors", "-o", tmp_path / "authors.ply")
-    run("prune", ply, "--keep", "9", "--by", "paper", "--opacity-weight", "1.0", "-o", tmp_path / "opacity.ply")
-    dense = read_ply(ply)
-    assert same(read_ply(tmp_path / "authors.ply"), prune(dense, 9, "authors"))
-    assert same(read_ply(tmp_path / "opacity.ply"), prune(dense, 9, "opacity"))
 
 
 def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
@@ -66,14 +62,12 @@ def test_a_small_scene_stays_in_its_format_or_its_growth_is_said(suffix, ply, tm
     assert f"note: {tmp_path / 'large.ply'} is larger than {scene}: " in capsys.readouterr().out
 
 
-def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
-    before = sorted(tmp_path.iterdir())
-    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run")
+def test_details_are_said_where_they_are_asked_for(ply, capsys):
+    words = ("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0")
+    run(*words)
     said = capsys.readouterr().out
-    assert sorted(tmp_path.iterdir()) == before
-    assert "dry run, nothing is written: pruned by coverage to 20 of 80 Gaussians (25 %)" in said
-    assert "SH degree" not in said
-    run("prune", ply, "--by", "coverage", "--keep", "0.25", "--sh", "0", "--dry-run", "--verbose")
+    assert "pruned by coverage to 20 of 80 Gaussians (25 %)" in said and "SH degree" not in said
+    run(*words, "--force", "--verbose")
     assert "SH degree 3 cut to 0: colours change 100% less with the view" in capsys.readouterr().out
 
 
@@ -83,7 +77,6 @@ def test_a_dry_run_says_all_and_writes_nothing(ply, tmp_path, capsys):
         (("--by", "best"), f"no method is called 'best'; expected one of {', '.join(METHODS)}"),
         (("--by", "merge", "--opacity-weight", "0.5"), "opacity weight 0.5: merge does not weigh opacity"),
         (("--keep", "half"), "keep is 'half'"),
-        (("--plot", "out.jpg"), "ends in .png"),
     ],
 )
 def test_options_that_fit_no_scene_are_refused_before_one_is_read(options, message, tmp_path, capsys):
@@ -138,3 +131,44 @@ def test_where_memory_is_short_a_scene_is_merged_in_parts_unasked(tmp_path, caps
     assert "not compared with the dense scene: it does not fit into memory" in capsys.readouterr().out
     assert len(read_ply(tmp_path / "parts.ply")) == 90
     run("prune", tmp_path / "scene.ply", "--by", "opacity", "-o", tmp_path / "score.ply")  # needs less, as before
+
+
+PROGRAM = """
+from pointsplat_ns.cli import main
+from pointsplat_ns.compression import prune_file
+prune_file.MEMORY = prune_file.MemorySettings(base=0, least=100)
+killed_after_steps(int(sys.argv[1]))
+main(["prune", "scene.ply", "--keep", "10%", *sys.argv[2:]])
+"""
+
+
+def pruned(folder: Path, *words: object, killed_at: int = 0) -> tuple[int, str]:
+    """Exit status and text of a command, killed after some of its first process's steps unless that is 0."""
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_AFTER_STEPS + PROGRAM, f"{killed_at}", *map(str, words)], cwd=folder,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, env=quick_start(),
+    )  # fmt: skip
+    return done.returncode, done.stdout
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes")
+def test_processes_that_share_a_scene_write_the_bytes_of_one_also_after_a_kill(tmp_path):
+    write_ply(normal_scene(600, degree=1, seed=3), tmp_path / "scene.ply")
+    parts = ("--memory", "50kB", "-o")
+    status, said = pruned(tmp_path, *parts, "alone.ply")
+    assert status == 0, said
+    status, said = pruned(tmp_path, *parts, "shared.ply", "--jobs", 2, killed_at=5)
+    assert status != 0 and not (tmp_path / "shared.ply").exists(), said
+    assert len(list((tmp_path / ".shared.ply.cells").glob("round*"))) >= 2
+    status, said = pruned(tmp_path, *parts, "shared.ply", "--jobs", 2)
+    assert status == 0 and said.count("merged to 60 of 600 Gaussians") == 1, said
+    assert (tmp_path / "shared.ply").read_bytes() == (tmp_path / "alone.ply").read_bytes()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_several_jobs_for_a_scene_that_fits_into_memory_are_refused(tmp_path, capsys):
+    write_ply(normal_scene(50), tmp_path / "scene.ply")
+    words = ("prune", tmp_path / "scene.ply", "--keep", "10%", "--jobs")
+    fits = "scene.ply: fits into memory; --jobs is for a scene that is merged in parts"
+    assert fits in refusal(capsys, tmp_path, *words, 2)
+    assert "jobs is 0; expected 1 or more" in refusal(capsys, tmp_path, *words, 0, "--memory", "10kB")

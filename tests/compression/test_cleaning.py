@@ -11,7 +11,7 @@ import pointsplat_ns as ps
 from making import box_room, same_bits, splats
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import cleaning
-from pointsplat_ns.compression.cleaning import FLOATING, PLACES, Cleaning, clean_scene, find_junk, floating_scores
+from pointsplat_ns.compression.cleaning import FLOATING, PLACES, clean_scene, find_junk, floating_scores
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
@@ -117,13 +117,6 @@ def test_what_cannot_be_drawn_goes_the_meaningless_first(room):
 def test_of_alike_ones_those_that_show_stay(scene, most):
     undrawable, unseen = junk_of(scene)
     assert undrawable == [] and len(unseen) <= most
-
-
-def test_a_scene_of_which_nothing_can_be_drawn_is_all_junk():
-    faint = box_room(0, 10).replace(opacities=torch.full((10, 1), -20.0))
-    junk = find_junk(faint, floating=sample_views(box_room(0, 10), 1, 8, 8), strength=1)
-    assert len(junk.undrawable) == 10 and junk.places == 0
-    assert len(Cleaning(junk, 10, ()).apply(faint, 4)) == 4
 
 
 @pytest.mark.parametrize(("by", "keep"), [("merge", 0.3), ("merge", 0.999), ("opacity", 1), ("opacity", 1.0)])

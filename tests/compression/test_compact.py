@@ -93,12 +93,11 @@ def test_a_refiner_that_helps_is_kept_with_the_figures_of_its_renders(scene, vie
     assert result.accepted
     assert same(result.pruned, pruned)
     assert same(result.scene, larger)
-    assert same(result.refined, larger)
     reference = DenseReference(scene, views)
     before, after = reference.psnr(pruned), reference.psnr(larger)
     assert after[0] > before[0] + 0.5, "the test's own refiner does not help"
     assert (result.before.psnr, result.before.worst) == before
-    assert (result.after.psnr, result.after.worst) == after
+    assert (result.last.after.psnr, result.last.after.worst) == after
     assert result.verdict == (
         f"refined by the network: {before[0]:.1f} -> {after[0]:.1f} dB PSNR against the dense scene "
         f"(3 views of {views.width} pixels; worst {before[1]:.1f} -> {after[1]:.1f} dB, better in 3)"
@@ -120,8 +119,8 @@ def test_what_is_not_finite_never_gets_out(scene, views):
     unsound = Unsound(refiner.config).eval()
     for source in (ViewSource(scene, given=views), NoViews(scene)):
         result = compacted(scene, trained(unsound), source)
-        assert not result.accepted and same(result.scene, pruned) and result.after is None
-        assert result.verdict == "not refined by the network: 7 of 200 refined Gaussians are not finite"
+        assert not result.accepted and same(result.scene, pruned) and result.stages[-1].after is None
+        assert result.verdict == "not refined by the network: 7 of 200 Gaussians are not finite"
 
 
 def test_without_views_refinement_is_left_out_with_the_reason(scene):
@@ -194,7 +193,7 @@ def test_what_most_views_pay_for_is_left_out(scene, views, monkeypatch, repaired
     monkeypatch.setattr(DenseReference, "closeness", closeness)
     result = compacted(scene, trained(tiny_refiner("scales", 0.1)), views, repair=REPAIRED)
     assert same(result.scene, pruned) and result.repaired.after.psnr > result.before.psnr + 3
-    assert closer_in(result.before, result.after) == 1
+    assert closer_in(result.before, result.repaired.after) == 1
     assert result.verdict.startswith("not refined by the network, it is farther in most views: ")
     assert "not repaired by 5 steps in 0.5 s, it is farther in most views: " in result.verdict
 

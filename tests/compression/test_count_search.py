@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from making import cloud
+from making import cloud, same
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.budget_search import (
     SLOPE,
@@ -22,7 +22,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
 from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.pruning import METHODS, WithinPsnr, cut_sh, score_of, select
 
 MOST = 100_000
 
@@ -42,9 +43,11 @@ def searched(measure, target, at_least, first=30_000, slope=6.0, tolerance=1e-6,
     def measured(count):
         assert 1 <= count <= MOST and count not in tried, "measured twice, or out of bounds"
         tried[count] = measure(count)
-        return tried[count]
+        return tried[count], count
 
-    return find_count(measured, target, at_least, first, MOST, slope, tolerance, **options), tried
+    found = find_count(measured, target, at_least, first, MOST, slope, tolerance, **options)
+    assert found.tried == tried
+    return found.best, tried
 
 
 @pytest.mark.parametrize("at_least", [True, False])
@@ -76,6 +79,18 @@ def test_tries_are_limited_once_one_meets_the_target():
     assert found is not None and len(tried) > 2
 
 
+def test_ctrl_c_gives_the_best_so_far_only_where_that_is_wanted():
+    def measure(count):
+        if count < MOST:
+            raise KeyboardInterrupt
+        return 1.0, count
+
+    with pytest.raises(KeyboardInterrupt):
+        find_count(measure, 0.5, True, MOST, MOST, 1.0, 0.1)
+    found = find_count(measure, 0.5, True, MOST, MOST, 1.0, 0.1, stoppable=True)
+    assert found.best == MOST and found.interrupted
+
+
 def test_bounds_are_tried_before_it_gives_up():
     found, tried = searched(MEASURES["bent"], 41.0, True)
     assert found is None and MOST in tried
@@ -86,31 +101,34 @@ def test_bounds_are_tried_before_it_gives_up():
 @pytest.mark.parametrize("wanted", [22.0, 30.0])
 def test_the_scene_found_is_good_enough_and_a_little_smaller_one_is_not(hollow_ball, ball_views, wanted):
     scores = score_of(hollow_ball, METHODS["coverage"])
-    calls, shares = [], []
-
-    def make(count):
-        calls.append(count)
-        return hollow_ball[select(scores, count)]
-
     reference = DenseReference(hollow_ball, ball_views)
-    found = smallest_within(len(hollow_ball), make, reference.psnr, wanted, shares.append)
-    assert found.psnr == reference.psnr(found.scene)[0] >= wanted and found.worst <= found.psnr + 1e-9
-    count = len(found.scene)
-    below = [k for k in calls if k < count]
-    assert found.psnr <= wanted + 0.1 or count <= max(max(below) * 1.05, max(below) + 1)
-    assert all(found.tried[k] < wanted for k in below)
-    assert len(calls) == len(set(calls)) <= 8
+
+    def measure(count):
+        scene = hollow_ball[select(scores, count)]
+        return reference.psnr(scene)[0], scene
+
+    scene, found = smallest_within(len(hollow_ball), measure, wanted)
+    count, psnr = len(scene), reference.psnr(scene)[0]
+    below = [k for k in found.tried if k < count]
+    assert psnr >= wanted and (psnr <= wanted + 0.1 or count <= max(max(below) * 1.05, max(below) + 1))
+    assert all(found.tried[k] < wanted for k in below) and len(found.tried) <= 8
+    shares = []
+    request, source = PruneRequest(WithinPsnr(wanted), "coverage"), ViewSource(hollow_ball, given=ball_views)
+    pruned = prune_scene(
+        hollow_ball, request, source, lambda what, share: shares.append(share) if what == "trying counts" else None
+    )
+    assert same(pruned.scene, scene) and f"sizes tried: {psnr:.1f} dB against the dense scene" in pruned.notes[-1]
     steps = [after - before for before, after in zip([0.0, *shares], shares, strict=False)]
     assert 0 < min(steps) and max(steps) <= 0.25 / len(ball_views) + 0.02 and shares[-1] < 1, "the bar never jumps"
 
 
 def test_a_psnr_out_of_reach_is_said(hollow_ball, ball_views):
-    psnr_of = DenseReference(hollow_ball, ball_views).psnr
+    reference = DenseReference(hollow_ball, ball_views)
     with pytest.raises(BudgetError, match="all 1500 Gaussians reach .* dB, not 60 dB"):
-        smallest_within(len(hollow_ball), lambda k: cut_sh(hollow_ball, 0)[:k], psnr_of, 60.0)
+        smallest_within(len(hollow_ball), lambda k: (reference.psnr(cut_sh(hollow_ball, 0)[:k])[0], k), 60.0)
     for wanted in (0.0, -3.0, math.nan, math.inf):
         with pytest.raises(BudgetError, match="expected a positive number"):
-            smallest_within(len(hollow_ball), lambda k: hollow_ball[:k], psnr_of, wanted)
+            WithinPsnr(wanted)
 
 
 def search(full, limit, encode=encode_spz):
@@ -125,8 +143,8 @@ def test_a_budget_for_less_than_one_gaussian_is_refused():
 
 def test_a_size_that_jumps_ends_the_search_with_what_fits():
     # Beyond 50 Gaussians the file is ten times as large.
-    found = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
-    assert found.tried[len(found.scene)] <= 600 and 1 <= len(found.scene) <= 50
+    scene, _, _ = search(cloud(100), 600, lambda scene, _: bytes(10 * len(scene) * (10 if len(scene) > 50 else 1)))
+    assert 1 <= len(scene) <= 50
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".splat", ".ply"])
@@ -153,14 +171,12 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
         )
         for half in (25.0, 35.0)
     }
-    for half, one in found.items():
-        wanted = rounding_for(few_psnr(psnr_of(half, one.scene), len(one.scene) / 4000), full.sh_degree)
-        assert one.limit.rounding.tolerance == pytest.approx(wanted.tolerance)
-    assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
-    for one in found.values():
-        small = one.limit.rounded(one.scene)
-        assert len(small) == len(one.scene) and 0.9 * 32_000 < one.tried[len(small)]
-        assert one.tried[len(small)] <= one.limit.bytes_of(small) <= 32_000
+    assert len(found[25.0][0]) > 1.1 * len(found[35.0][0])
+    for half, (scene, rounded, _) in found.items():
+        wanted = rounding_for(few_psnr(psnr_of(half, scene), len(scene) / 4000), full.sh_degree)
+        assert rounded.rounding.tolerance == pytest.approx(wanted.tolerance)
+        small = rounded.rounded(scene)
+        assert len(small) == len(scene) and 0.9 * 32_000 < rounded.bytes_of(small) <= 32_000
 
 
 @pytest.mark.parametrize("kept", [1e-9, 0.1, 0.5, 0.9, 1 - 1e-9])
@@ -184,8 +200,8 @@ def test_a_scene_is_rounded_as_far_as_its_size_needs():
 
 def test_all_are_kept_unrounded_if_all_fit():
     full, limit = cloud(500), FileLimit(format_to_write(".sog"), 10**6)
-    found = largest_within(full, lambda count: full[:count], limit, lambda share: None)
-    assert found.scene is full and found.limit.rounded(full) is full
+    scene, unrounded, _ = largest_within(full, lambda count: full[:count], limit, lambda share: None)
+    assert scene is full and unrounded.rounded(full) is full
     larger = cloud(1000, seed=1)  # as a repair may make one
-    tight = FileLimit(found.limit.kind, found.limit.bytes_of(larger) * 4 // 5)
+    tight = FileLimit(limit.kind, limit.bytes_of(larger) * 4 // 5)
     assert tight.bytes_of(tight.rounded(larger)) <= tight.most

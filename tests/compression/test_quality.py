@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from making import box_room
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.comparing.fill import fill
-from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, quality_of_file, through_file
+from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, judge_of, quality_of_file, through_file
 from pointsplat_ns.io import save
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.view_source import ViewSource
@@ -43,9 +44,8 @@ def test_a_file_that_loses_is_judged_as_it_is_read(dense, tmp_path):
     read = through_file(dense, ".splat")[1]
     wanted = Judge(dense, source).quality(read)
     assert 10 < wanted.psnr < 60 and "looks the same" not in str(wanted)
-    for path in (None, tmp_path / "same.splat"):
-        assert quality_of_file(dense, source, dense, path, ".splat") == wanted
-    exact = quality_of_file(dense, source, dense, None, ".ply")
+    assert quality_of_file(Judge(dense, source), dense, tmp_path / "same.splat") == wanted
+    exact = quality_of_file(Judge(dense, source), dense, tmp_path / "same.ply")
     assert str(exact) == "more than 60 dB, SSIM 1.00: looks the same" and "inf" not in exact.details
 
 
@@ -73,4 +73,4 @@ def test_photos_lead_where_they_were_trained_on():
 
 def test_where_nothing_is_visible_nothing_is_judged(dense):
     unseen = dense.replace(opacities=dense.opacities - 100)
-    assert quality_of_file(unseen, ViewSource(unseen), unseen, None, ".ply") is None
+    assert quality_of_file(judge_of(unseen, ViewSource(unseen)), unseen, Path("unseen.ply")) is None

@@ -1,6 +1,5 @@
 """A trained refiner is loaded from a file of weights or from a run, without nerfstudio."""
 
-import importlib.resources
 import os
 from pathlib import Path
 
@@ -8,12 +7,11 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import ball, normal_scene
+from making import normal_scene
 from pointsplat_ns.compression.trained_refiner import load_refiner, open_refiner_run, scenes_of_run
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, save_refiner
-from pointsplat_ns.refiner.weights import SHIPPED_REFINER
 
 
 def network(head: str = "scales", moved: float = 0.2) -> Refiner:
@@ -66,15 +64,6 @@ def test_anything_else_is_no_refiner(tmp_path):
     (tmp_path / "config.yml").touch()  # of a run in the same folder
     with pytest.raises(WeightsError, match="pipe: not a regular file; expected a trained pointsplat run"):
         load_refiner(tmp_path / "pipe")
-
-
-def test_the_installed_package_holds_the_refiner_that_ships_and_its_card():
-    folder = importlib.resources.files("pointsplat_ns") / "refiner" / "pretrained"
-    assert SHIPPED_REFINER.samefile(str(folder / "refiner.safetensors"))
-    assert SHIPPED_REFINER.stat().st_size <= 10e6 and (folder / "CARD.md").is_file()
-    scene = ball(60, degree=3)
-    refined = load_refiner()(scene)
-    assert len(refined) == 60 and bool(refined.usable().all())
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

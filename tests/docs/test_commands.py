@@ -106,16 +106,13 @@ def test_command_makes_the_room_small(command, cut_room, tmp_path, monkeypatch):
     default = {"prune": "room_pruned.ply", "compact": "room_compact.ply"}[words[1]]
     default = "room_web.sog" if "--for" in words else default
     output = Path(words[words.index("-o") + 1] if "-o" in words else default)
-    if "--dry-run" in words:
-        assert not output.exists()
-    elif "auto:35" in words:  # few Gaussians may all be needed
+    if "auto:35" in words:  # few Gaussians may all be needed
         small, views = ps.load(output), ps.sample_views(ps.load("room.ply"), 12, 64, 48)  # as conftest.py has it
         errors = (ps.render(small, views) - ps.render(ps.load("room.ply"), views)).double().square().mean()
         assert errors < 10**-3.4  # 35 dB, and what the rounding of an SPZ adds
     else:
         assert 0 < len(ps.load(output)) < CUT + bool({"--for"} & {*words})  # all of it may fit
-    for option in ("--plot", "--picture"):
-        assert option not in words or Path(words[words.index(option) + 1]).stat().st_size > 1000
+    assert "--picture" not in words or Path(words[words.index("--picture") + 1]).stat().st_size > 1000
 
 
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: str(page.relative_to(ROOT)))

@@ -17,7 +17,9 @@ from making import ball, normal_scene
 from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.levels.errors import pixel_size_for
+from pointsplat_ns.levels.levels import LevelOutput
 from pointsplat_ns.levels.tiles import write_tiles
+from pointsplat_ns.system.progress import silent
 
 TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 """What viewers of 3D Tiles do to glTF."""
@@ -161,10 +163,10 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
     write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(ps.SceneError, match=r"tileset\.json: exists already"):
-        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
+        LevelOutput(tmp_path / "a", "tiles", None, None, force=False).check(2)
     monkeypatch.setattr("pointsplat_ns.levels.tiles.encode_tile", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double(), force=True)
+        write_tiles(tmp_path / "a", levels, parents, [1.0, 2.0], torch.eye(4).double())
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     ps.save(normal_scene(20), tmp_path / "room.ply")
     for options, words in (
@@ -180,8 +182,8 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
 
 def test_levels_without_views_have_the_errors_of_their_sizes(tmp_path):
     scene = ball(300, opacity=1.0, bright=1.0)
-    made = replace(ps.lod(scene, ["100%", "10%"], views=ps.sample_views(scene, 2, 48, 36)), reference=None)
-    assert made.save_tiles(tmp_path) == [300, 30]
+    made = replace(ps.lod(scene, ["100%", "10%"], views=ps.sample_views(scene, 2, 48, 36)), views=None)
+    LevelOutput(tmp_path, "tiles", None, None, force=False).write(made, silent)
     _, tiles = tiles_of(tmp_path)
     wanted = 16 * float(made[1].scene.stds.median(dim=1).values.median())
     assert max(tile["geometricError"] for tile, _ in tiles) == pytest.approx(wanted, rel=1e-5)

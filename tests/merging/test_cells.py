@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from lab.common.timing import start_of_peak
 from making import assert_same_on_any_threads, box_room, cloud, same_bits
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import prune_file
@@ -20,7 +21,6 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.merging.by_cells import merge_file
 from pointsplat_ns.merging.cells import Scratch, divided
-from pointsplat_ns.system.memory import PeakMemory
 
 
 def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
@@ -144,22 +144,27 @@ from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.merging import cells
 from pointsplat_ns.merging.by_cells import merge_file
 from pointsplat_ns.merging.settings import MERGING
-from pointsplat_ns.system.memory import PeakMemory
+from lab.common.timing import start_of_peak, status_bytes
+from pointsplat_ns.system.memory import give_back_freed_memory
 cells.ROWS_AT_ONCE, cells.OVERVIEW = 1 << 13, 1 << 12
 peaks = []
 for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for imports and kernels
-    folder, peak = Path(sys.argv[1]) / name, PeakMemory()
-    peaks.append(peak.bytes())
+    folder = Path(sys.argv[1]) / name
+    give_back_freed_memory()
+    start_of_peak()
+    peaks.append(status_bytes("VmHWM"))
     rows = PlyRows.open(folder / "scene.ply")
     blind = replace(MERGING, min_count_rendered=10**9)
     merge_file(rows, lambda n: n // 10, folder / "small.ply", most, cells.Scratch(folder / "cells", {}), settings=blind)
-    peaks.append(peak.bytes())
+    peaks.append(status_bytes("VmHWM"))
 print(peaks[3] - peaks[2])
 """
 
 
 def test_memory_is_that_of_a_cell_and_not_of_the_scene(tmp_path):
-    if PeakMemory().bytes() is None:
+    try:
+        start_of_peak()
+    except OSError:
         pytest.skip("this system does not tell the most memory that was held")
     most, sh_bytes = 5_000, 236
     rows_of(cloud(2000, seed=7), tmp_path / "few")

@@ -105,13 +105,10 @@ def results_of(scene: Path, folder: Path) -> dict[str, Any]:
     found["refined"] = ps.refine(found["pruned by paper"], refiner)
     levels = ps.lod(room, ["50%", 60], views=views, folder=folder / "levels")
     found["levels"] = [level.scene for level in levels]
-    ps.lod(room, ["50%", 60], views=views, folder=folder / "stream", stream=True)
     for suffix in (".ply", ".spz", ".sog", ".splat"):
         ps.save(room, folder / f"room{suffix}")
         found[suffix] = ps.load(folder / f"room{suffix}")
     found["info"] = ps.info(scene)
-    ps.plot_views(room, folder / "views.png", views=views)
-    ps.plot_distributions({"before": room, "after": compacted.scene}, folder / "distributions.png")
     ps.write_page(room, folder / "room.html", views=views)
     files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     return {name: plain(value) for name, value in found.items()} | files

@@ -1,7 +1,11 @@
-"""Kernels, memory and threads."""
+"""Kernels, which an installation builds where there is a compiler; cores and threads."""
 
+import ctypes
 import math
 import os
+import re
+import shutil
+import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +17,61 @@ import torch
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system import kernels
 from pointsplat_ns.system.cores import cores, cpu_quota
+from pointsplat_ns.system.kernels import KERNELS, Kernels, structs_of
+from pointsplat_ns.system.native import INCLUDE, IS_X86, cpp_files, library_path
 from pointsplat_ns.system.threads import fixed_threads
+
+COMPILER = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize("source", cpp_files(), ids=lambda source: source.stem)
+def test_structs_are_laid_out_as_the_compiler_lays_them_out(source, tmp_path):
+    text = source.read_text("utf-8")
+    included = [source.with_name(name) for name in re.findall(r'^#include "(.+)"$', text, re.M)]
+    structs = structs_of("".join(path.read_text("utf-8") for path in (*included, source) if path.is_file()))
+    assert structs
+    lines = ["#include <cstddef>", f'#include "{source}"']
+    for name, struct in structs.items():
+        lines.append(f"static_assert(sizeof({name}) == {ctypes.sizeof(struct)});")
+        places = {field: getattr(struct, field).offset for field, _ in struct._fields_}
+        lines += [f"static_assert(offsetof({name}, {field}) == {place});" for field, place in places.items()]
+    check = tmp_path / "check.cpp"
+    check.write_text("\n".join(lines) + "\n", "utf-8")
+    subprocess.run([COMPILER, "-std=c++17", "-fsyntax-only", f"-I{INCLUDE}", str(check)], check=True)
+
+
+def test_a_library_that_is_missing_old_or_damaged_is_not_loaded(tmp_path):
+    how = "where there is a C++ compiler, installing builds them (in a clone: pip install -e .)"
+    library = tmp_path / "kernels.0123456789abcdef.so"
+    assert Kernels(library).why_missing == f"they were not built; {how}"
+    (tmp_path / "kernels.0123456789abcdee.so").touch()
+    assert Kernels(library).why_missing == f"they were built from other sources; {how}"
+    library.write_bytes(b"no library")
+    assert Kernels(library).why_missing.startswith(f"{library}: ")
+
+
+@pytest.mark.skipif(not IS_X86, reason="other processors have all that the kernels need")
+def test_a_processor_without_avx2_loads_no_library(monkeypatch):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
+    assert "no AVX2" in Kernels(library_path()).why_missing
+
+
+def test_a_change_of_any_source_gives_the_library_another_name(monkeypatch):
+    names, read = {library_path().name}, Path.read_bytes
+    changed = [cpp_files()[0], cpp_files("*.h")[-1]]
+    for source in changed:
+        monkeypatch.setattr(Path, "read_bytes", lambda path, source=source: read(path) + b"\n" * (path == source))
+        names.add(library_path().name)
+    assert len(names) == 3
+
+
+@needs_compiler
+def test_where_there_is_a_compiler_kernels_are_used():
+    """Tests of kernels skip where none can be used; this one tells of a library that is missing or old."""
+    assert KERNELS.why_missing == ""
 
 
 def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusing import refusal, run
 
 import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.quality import Judge
+from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.levels import folder as level_folder
+from pointsplat_ns.levels.stream import Node, partition
 
 ASKED = ("50%", "25%", "10%", "3%")
 
@@ -148,3 +151,78 @@ def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, 
     assert 0 < cut[1].quality.psnr < cut[0].quality.psnr
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
     assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
+
+
+@pytest.fixture()
+def ply(tmp_path) -> Path:
+    ps.save(ball(400, opacity=1.0, bright=1.0), tmp_path / "room.ply")
+    return tmp_path / "room.ply"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options"),
+    [
+        ((), {}),
+        (("--levels", "10%", "0.5", "20", "--sh", "0"), {"levels": [0.5, "10%", 20], "sh": "0"}),
+        (("--levels", "0.01MB"), {"levels": ["0.01MB"]}),
+    ],
+)
+def test_pointsplat_lod_writes_what_lod_gives_bit_for_bit(arguments, options, ply, tmp_path):
+    run("lod", ply, *arguments, "-o", tmp_path / "by_command")
+    ps.lod(ply, **options).save(tmp_path / "by_api")
+    assert contents(tmp_path / "by_command") == contents(tmp_path / "by_api")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--levels", "50%", "200"), "levels 50% and 200 both mean 200 of 400 Gaussians"),
+        (("--levels", "auto:35"), "level auto:35: expected a ratio"),
+        (("-o", "levels.ply"), "levels.ply: levels are several files; expected the name of a folder"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_one_line_and_writes_nothing(arguments, message, ply, tmp_path, capsys):
+    assert message in refusal(capsys, tmp_path, "lod", ply, *arguments)
+
+
+@pytest.fixture(scope="module")
+def three_levels(scene, views) -> ps.Levels:
+    return ps.lod(scene, ["100%", "50%", "10%"], views=views)
+
+
+def leaves_of(node: Node) -> list[Node]:
+    return [leaf for child in node.children for leaf in leaves_of(child)] if node.children else [node]
+
+
+def test_each_gaussian_that_is_drawn_is_in_one_leaf_with_its_parent(three_levels):
+    parents = three_levels.parents
+    leaves = leaves_of(partition(three_levels.scenes, parents, 100))
+    assert len(leaves) > 3
+    for index, scene in enumerate(three_levels.scenes):
+        rows = torch.cat([leaf.rows[index] for leaf in leaves])
+        kept = torch.arange(len(scene)) if index else (parents[0] >= 0).nonzero()[:, 0]
+        assert torch.equal(rows.sort().values, kept)
+    for leaf in leaves:
+        for finer, coarser, of in zip(leaf.rows, leaf.rows[1:], parents, strict=False):
+            assert set(of[finer].tolist()) == set(coarser.tolist()), "no gap and nothing twice between levels"
+    largest = int(torch.bincount(parents[1][parents[0][parents[0] >= 0]]).max())  # one family is not cut
+    assert max(len(leaf.rows[0]) for leaf in leaves) <= max(100, largest)
+    assert len(leaves_of(partition(three_levels.scenes, parents, 400))) == 1
+
+
+def test_wide_leaves_of_many_gaussians_are_cut(three_levels):
+    leaves = leaves_of(partition(three_levels.scenes, three_levels.parents, 400, extent=0.5, least=40))
+    for leaf in leaves:
+        means = three_levels[-1].scene.means[leaf.rows[-1]]
+        assert len(leaf.rows[0]) <= 40 or float((means.amax(dim=0) - means.amin(dim=0)).max()) <= 0.5
+    assert len(leaves) > 3
+
+
+def test_the_command_writes_a_stream_of_the_scene_and_its_levels(ply, tmp_path, capsys):
+    words = ("lod", ply, "--stream", "--levels", "25%", "50%")
+    run(*words)
+    folder = tmp_path / "room_stream"
+    assert "level_2" in capsys.readouterr().out and not (folder / "lod.json").exists()
+    assert json.loads((folder / "lod-meta.json").read_text())["counts"] == [400, 200, 100]
+    assert [len(read_sog_stream(folder, level)) for level in range(3)] == [400, 200, 100]
+    assert "exists already" in refusal(capsys, tmp_path, *words)
