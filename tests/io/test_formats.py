@@ -10,8 +10,7 @@ from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
 from making import SHARED_DATA, cloud, normal_scene, same_bits
-from pointsplat_ns.io.formats import format_to_read
-from pointsplat_ns.io.formats.registry import format_named
+from pointsplat_ns.io.formats import format_named, format_to_read
 from pointsplat_ns.io.formats.spz import encode_spz
 
 FIXED = (".ply", ".splat")

@@ -39,7 +39,7 @@ from pointsplat_ns.io.formats.coding import (
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
-from pointsplat_ns.io.formats.sog_images import META, Images, webp
+from pointsplat_ns.io.formats.sog_images import SOG_META, Images, webp
 from pointsplat_ns.system.progress import Progress, silent
 
 MAX_SIDE = 16_383
@@ -47,8 +47,6 @@ MAX_SIDE = 16_383
 
 _LEVELS = 65_535  # of positions, steps
 _ACROSS = 64  # palette entries in one row of pixels
-_MOST_ENTRIES = 65_536  # of a palette
-_LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
 
 
 def read_sog(path: Path | str) -> Gaussians:
@@ -84,12 +82,12 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
     logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / _LEVELS
     quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])
-    tops = quats[:, 3].astype(np.int64) - _LARGEST
+    tops = quats[:, 3].astype(np.int64) - 252  # alpha is this plus the index of the largest component
     rotations = from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
     rotations[tops < 0] = (1, 0, 0, 0)  # as the viewers of this format do
     dc = _looked_up(meta["sh0"], colors, 3 if version == 2 else 4)
     return scene_of(
-        np.sign(logs) * np.expm1(np.abs(logs)),
+        _of_logs(logs),
         _looked_up(meta["scales"], pixels(meta["scales"]), 3),
         rotations,
         logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
@@ -171,7 +169,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
         images[name] = (np.column_stack(columns).astype(np.uint8), width, height)
         return [name]
 
-    levels, mins, maxs = _levels_of(scene)
+    levels, mins, maxs, _ = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
     scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
@@ -186,7 +184,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
             "files": add("means_l.webp", [steps & 255]) + add("means_u.webp", [steps >> 8]),
         },
         "scales": {"codebook": _short(scales), "files": add("scales.webp", [scale_index.numpy()])},
-        "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), _LARGEST + largest])},
+        "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), 252 + largest])},
         "sh0": {
             "codebook": _short(colors),
             "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
@@ -200,7 +198,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     for done, (name, image) in enumerate(images.items()):
         progress("compressing", done / len(images))
         files[name] = webp(*image)
-    return {META: json.dumps(meta).encode(), **files}
+    return {SOG_META: json.dumps(meta).encode(), **files}
 
 
 def _short(book: Tensor) -> list[float]:
@@ -210,21 +208,22 @@ def _short(book: Tensor) -> list[float]:
     return [float(f"{value:.9g}") for value in book[: last + 1].tolist()] + [0] * (len(book) - last - 1)
 
 
-def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
-    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, and the logarithms that are these two, (3,) each."""
+def _of_logs(logs: Array) -> Array:
+    """Positions of their logarithms."""
+    return np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
+    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, the logarithms that are these two, (3,) each, and the
+    steps of positions there, (N, 3) float64, world units."""
     means = scene.means.double().numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
-    return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _LEVELS, mins, maxs
+    levels = (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _LEVELS
+    return levels, mins, maxs, torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())
 
 
-def _position_steps(scene: Gaussians) -> Tensor:
-    """Along the axis with the coarsest levels, (N,)."""
-    _, mins, maxs = _levels_of(scene)
-    return (torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())).amax(dim=1)
-
-
-HOLDS = Holds(sizes=Span(-30.0), position_steps=_position_steps)
+HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1))
 
 
 def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
@@ -234,12 +233,11 @@ def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
     if not rounding.tolerance or not len(scene):
         return scene
     steps = steps_of(scene, rounding.tolerance)
-    levels, mins, maxs = _levels_of(scene)
-    of_level = torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())  # world units
+    levels, mins, maxs, of_level = _levels_of(scene)
     coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
     outermost = (levels <= 0) | (levels >= _LEVELS)  # they stay, so that levels keep their meaning
     logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, _LEVELS)) / _LEVELS
-    means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
+    means = torch.from_numpy(_of_logs(logs)).float()
     rest = _few_sh(scene, rounding.tolerance) if scene.sh_degree else scene.features_rest
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
 
@@ -249,7 +247,7 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
     one entry for two Gaussians. Its numbers are multiples of their error."""
     rows, each = scene.features_rest.flatten(1), weights(scene)
     wanted = ROUNDING.palette_error * tolerance / (SH_C0 * scene.features_rest.shape[1] ** 0.5)
-    most = min(len(scene) // 2, _MOST_ENTRIES)
+    most = min(len(scene) // 2, 65_536)
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
         """A palette of a number of entries, the index of each Gaussian's, and the error of a coefficient."""

@@ -24,7 +24,7 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import read_text, replacing, require_file, require_memory
 from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts
-from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.io.formats.sog_images import SOG_META
 from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -101,7 +101,7 @@ def stream_parts(path: Path) -> list[Path]:
         names = [name for name in (*meta["filenames"], meta.get("environment")) if name is not None]
         found = [path]
         for file in (_beside(path, name) for name in names):
-            found += [file] if file.name != META else sorted(file.parent.glob("*.webp")) + [file]
+            found += [file] if file.name != SOG_META else sorted(file.parent.glob("*.webp")) + [file]
         return found
 
 
@@ -135,7 +135,7 @@ def write_sog_stream(
         file, held = open_file[level]
         if file < 0 or held > chunk:
             file, held = len(names), 0
-            names.append(f"{level}_{level_of.count(level)}/{META}")
+            names.append(f"{level}_{level_of.count(level)}/{SOG_META}")
             level_of.append(level)
             rows[file] = []
         rows[file].append(members)
@@ -173,7 +173,7 @@ def write_sog_stream(
             scene = levels[level_of[file]][torch.cat(rows[file])]
             folder = path.parent / name.partition("/")[0]
             parts = sog_parts(scene, _part_of(progress, file, len(names)), ordered=True)
-            for part, data in sorted(parts.items(), key=lambda item: item[0] != META):
+            for part, data in sorted(parts.items(), key=lambda item: item[0] != SOG_META):
                 stack.enter_context(replacing(folder / part, len(data))).write_bytes(data)
         path.unlink(missing_ok=True)
     return meta
@@ -216,8 +216,8 @@ def _beside(path: Path, name: Any) -> Path:
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set("\\:") & set(name):
         raise SceneError(f"{path}: names the file {name!r}; expected one in its own folder")
-    if parts[-1] != META and not name.lower().endswith(".sog"):
-        raise SceneError(f"{path}: names the file {name!r}; expected a {META} or a .sog")
+    if parts[-1] != SOG_META and not name.lower().endswith(".sog"):
+        raise SceneError(f"{path}: names the file {name!r}; expected a {SOG_META} or a .sog")
     return path.parent.joinpath(*parts)
 
 
