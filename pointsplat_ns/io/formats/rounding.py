@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,20 +70,14 @@ def rounding_for(psnr: float, sh_degree: int) -> Rounding:
     return Rounding(share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20))
 
 
-_UNIFORM = math.sqrt(12)  # steps of rounding for a root mean squared error of 1
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(NamedTuple):
     """The largest steps that the numbers of N Gaussians may be rounded to, each (N, 1) float64."""
 
     sh: Tensor
     alphas: Tensor
     log_scales: Tensor
-    means: Tensor
-    """World units."""
-    quats: Tensor
-    """Of quaternions of length 1."""
+    means: Tensor  # world units
+    quats: Tensor  # of quaternions of length 1
 
 
 def weights(scene: Gaussians) -> Tensor:
@@ -95,12 +90,13 @@ def weights(scene: Gaussians) -> Tensor:
 def steps_of(scene: Gaussians, tolerance: float) -> Steps:
     """The steps of N usable Gaussians on the CPU, for a tolerance of a Gaussian of usual weight."""
     each = (tolerance * weights(scene).rsqrt())[:, None]
-    shape = _UNIFORM * each / ROUNDING.contrast
+    uniform = math.sqrt(12)  # steps of rounding for a root mean squared error of 1
+    shape = uniform * each / ROUNDING.contrast
     logs = scene.scales.double().sort(dim=1).values
     ratio = (logs[:, 2:] - logs[:, :1]).clamp(max=-math.log(ROUNDING.thinnest))
     smallest = (logs[:, 2:] - ratio).exp()
     return Steps(
-        sh=_UNIFORM * each / SH_C0,
+        sh=uniform * each / SH_C0,
         alphas=shape * scene.alphas.double().reshape(-1, 1),
         log_scales=shape / math.sqrt(0.75),
         means=shape * math.sqrt(2) * smallest,

@@ -251,7 +251,7 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
         """A palette of a number of entries, the index of each Gaussian's, and the error of a coefficient."""
-        book, index = palette(rows, lambda done: None, 64 * max(int(share / 64), 1), each)
+        book, index = palette(rows, 64 * max(int(share / 64), 1), each, lambda done: None)
         return book, index, float((each @ (book[index] - rows).double().square().mean(dim=1) / each.sum()).sqrt())
 
     size = len(scene) / ROUNDING.most_rows
@@ -272,7 +272,8 @@ def _pack_sh(
     """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
     rest = scene.features_rest.shape[1]
     report = functools.partial(progress, "making the SH palette")
-    rows, index = palette(scene.features_rest.flatten(1), report, weights=weights(scene))
+    entries = max(1024, 1 << min(len(scene), 65_536).bit_length() >> 1)  # a power of two; an index has 16 bits
+    rows, index = palette(scene.features_rest.flatten(1), entries, weights(scene), report)
     levels, level_index = codebook(rows)
     labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])
     images["shN_centroids.webp"] = (level_index.reshape(-1, 3).numpy(), _ACROSS * rest, len(rows) // _ACROSS)
