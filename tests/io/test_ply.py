@@ -15,7 +15,7 @@ from refusing import fails as refused
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, read_scene, write_ply
-from pointsplat_ns.io.ply_writing import column_names
+from pointsplat_ns.io.ply import column_names
 
 
 def rows_of(path):
@@ -90,10 +90,6 @@ def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
     path, scene = tmp_path / "a.ply", normal_scene(5, 1)
     write_ply(scene, path)
     assert same_bits(scene, read_ply(path)) and not caplog.records
-    path.write_bytes(path.read_bytes() + b"xyz")
-    assert same_bits(scene, read_ply(path))
-    assert caplog.messages == [f"{path}: not read: 3 bytes after the last element"]
-    caplog.clear()
     rows = rows_of(path)
     extra = numpy.lib.recfunctions.append_fields(rows, ["red", "class"], [np.zeros(5, "u1"), np.ones(5, "i4")])
     rewrite(path, extra.data)

@@ -26,9 +26,8 @@ from pointsplat_ns.io.formats.sog_images import SOG_META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.formats.splat import encode_splat, read_splat
 from pointsplat_ns.io.formats.spz import encode_spz, read_spz, rounded_for_spz
-from pointsplat_ns.io.ply import read_ply
+from pointsplat_ns.io.ply import ply_bytes, read_ply, write_ply
 from pointsplat_ns.io.ply_header import read_header
-from pointsplat_ns.io.ply_writing import ply_bytes, write_ply
 from pointsplat_ns.io.splatfacto import read_checkpoint
 from pointsplat_ns.system.progress import Progress
 
