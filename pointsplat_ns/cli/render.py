@@ -46,8 +46,7 @@ def render(
     """
     options.need_scenes(scene, other)
     import pointsplat_ns as ps
-    from pointsplat_ns.io.files import bytes_text
-    from pointsplat_ns.io.outputs import need_folder, need_writable
+    from pointsplat_ns.io.files import bytes_text, need_folder, need_writable
     from pointsplat_ns.pages.video import kind_of
 
     start = time.perf_counter()

@@ -10,8 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits, sh_degree_of
-from pointsplat_ns.io.files import logger, one_line, replacing, require_file, require_memory
+from pointsplat_ns.io.files import failure_named, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
 from pointsplat_ns.io.ply_dialects import COLUMNS, FILTER, attributes_of, columns_of, is_flat
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
@@ -64,7 +63,7 @@ class PlyRows:
 
     def __init__(self, path: Path | str, warn: bool = True):
         self.path = path = require_file(path, "a 3DGS PLY file")
-        with _opened(path) as stream:
+        with failure_named(path, "read"), path.open("rb") as stream:
             self._header = header = read_header(stream, path)
         self._vertex = vertex = _gaussian_element(header, path)
         self.count, self._in_file = vertex.count, _num_rest(vertex, path)
@@ -109,7 +108,7 @@ class PlyRows:
         tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
         at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
         # A double beyond float32 becomes Inf and is dropped with the others.
-        with np.errstate(over="ignore"), _opened(self.path) as stream:
+        with np.errstate(over="ignore"), failure_named(self.path, "read"), self.path.open("rb") as stream:
             for start in range(0, len(rows), at_once):
                 chunk = slice(start, min(start + at_once, len(rows)))
                 values = self._rows(stream, rows[chunk])
@@ -151,7 +150,7 @@ class PlyRows:
 
     def _shift_positions(self, warn: bool) -> None:
         """Subtract an offset from positions that float32 would round too far, which is logged if ``warn``."""
-        with _opened(self.path) as stream:
+        with failure_named(self.path, "read"), self.path.open("rb") as stream:
             rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
         scales = [name for name in COLUMNS["scales"] if name in self._names]
         self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, scales))
@@ -161,16 +160,6 @@ class PlyRows:
             if warn:
                 text = offset_text((x, y, z))
                 logger.info("%s: positions are doubles; their offset %s is kept beside the scene", self.path, text)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[io.BufferedReader]:
-    """The file, open. Raises SceneError if it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            yield stream
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
 
 
 def _doubles(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:

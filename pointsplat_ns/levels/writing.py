@@ -8,8 +8,8 @@ from typing import Literal
 
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.geometry.earth import Place
+from pointsplat_ns.io.files import need_folder, need_writable
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
-from pointsplat_ns.io.outputs import need_folder, need_writable
 from pointsplat_ns.levels.folder import check_folder, level_names
 from pointsplat_ns.levels.levels import Levels
 from pointsplat_ns.levels.tiles import TILESET

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, Traits
-from pointsplat_ns.io.files import one_line, replacing
+from pointsplat_ns.io.files import failure_named, one_line, replacing
 from pointsplat_ns.io.formats import sog, splat, spz
 from pointsplat_ns.io.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.io.formats.holding import Holds
@@ -128,12 +128,10 @@ def format_to_read(path: Path) -> Format | None:
     known. Raises SceneError if the file cannot be read, or its format is known and not read."""
     if path.is_dir():
         return next((format_named(name) for name in (STREAM_META, SOG_META) if (path / name).is_file()), None)
-    try:
+    with failure_named(path, "read"):
         with path.open("rb") as stream:
             start = stream.read(64)
         kind = _told_by_content(path, start) or format_named(path.name)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
     if kind is not None and kind.read is None:
         raise SceneError(f"{path}: {kind.name} files are not read; {kind.instead}")
     return kind
