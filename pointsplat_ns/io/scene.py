@@ -100,7 +100,7 @@ def _found(path: Path) -> tuple[Callable[[Path], Gaussians], Path, str, Run | No
             with suppress(SceneError):  # it lies outside of one
                 run = open_run(path, need_data=False)
         return kind.read, path, kind.name, run
-    if is_run or path.suffix.lower() in RUN_FILES.configs:
+    if is_run or path.suffix.lower() in (".yml", ".yaml"):
         run = open_run(path, need_data=False)
         return read_checkpoint, run.checkpoint, "run", run
     what = (

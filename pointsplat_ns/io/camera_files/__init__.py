@@ -25,7 +25,7 @@ from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
 from pointsplat_ns.io.camera_files.json_cameras import inria_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
-from pointsplat_ns.io.runs import RUN_FILES, read_transforms
+from pointsplat_ns.io.runs import RUN_FILES, may_be_run, read_transforms
 from pointsplat_ns.views import Views
 
 CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model or project"
@@ -71,7 +71,7 @@ def is_camera_file(path: Path | str) -> bool:
         return model_folder(path) is not None or not any(
             (path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META)
         )
-    return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
+    return not may_be_run(path) and format_named(path.name) is None
 
 
 def camera_files_near(scene: Path) -> list[Path]:
