@@ -21,7 +21,6 @@ import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, matrix, need_count, rigid
-from pointsplat_ns.io.files import logger
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
@@ -30,19 +29,15 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
-    distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
-    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *distortion)
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model")
+    names += ("k1", "k2", "k3", "k4", "p1", "p2")
     found = []
-    bent = 0
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'")
         # A frame may have none of these, or hundreds of others.
         said = {name: frame.get(name, content.get(name)) for name in names}
         found.append(_camera(frame, said, index, path))
-        bent += said["camera_model"] in ("OPENCV_FISHEYE", "FISHEYE") or any(finite(said[k]) for k in distortion)
-    if bent:
-        logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found))
     return CameraFile(found, _saved_motion(content, path))
 
 
