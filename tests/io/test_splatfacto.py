@@ -149,8 +149,6 @@ windows: !!python/object/apply:pathlib.WindowsPath ['C:\\', data]
 here: !!python/object/apply:pathlib.PosixPath []
 size: !!python/tuple [1, 2.5, null]
 enum: !!python/object/apply:some.where.Enum [value]
-text: !!python/str '12'
-number: !!python/long 12
 inner: !!python/object:some.where.Inner {a: 1.0e-15}
 other: !something {b: true}
 """,
@@ -165,8 +163,6 @@ other: !something {b: true}
         "here": Path("."),
         "size": (1, 2.5, None),
         "enum": Tagged("some.where.Enum", ["value"]),
-        "text": "12",
-        "number": 12,
         "inner": Tagged("some.where.Inner", {"a": 1e-15}),
         "other": Tagged("!something", {"b": True}),
     }

@@ -14,15 +14,8 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, sh_degree_of
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import require_file, require_memory
-from pointsplat_ns.io.formats.coding import (
-    Array,
-    Blocks,
-    damage_named,
-    from_smallest_three,
-    load_bytes,
-    logits_of_bytes,
-    scene_of,
-)
+from pointsplat_ns.io.formats import coding
+from pointsplat_ns.io.formats.coding import Array, Blocks
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -43,12 +36,12 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
     """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError
     if the file is no compressed PLY, is truncated, or does not fit into memory."""
     path = require_file(path, "a compressed PLY file")
-    with damage_named(path, "compressed PLY"):
+    with coding.damage_named(path, "compressed PLY"):
         with path.open("rb") as stream:
             header = read_header(stream, path)
         count, rest = _checked(header, path)
         require_memory(path, path.stat().st_size + 4 * count * (14 + 3 * rest))
-        blocks = Blocks(load_bytes(path), path, header.size)
+        blocks = Blocks(coding.load_bytes(path), path, header.size)
         data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
         return _decode(data["chunk"], data["vertex"], data.get("sh"), rest).replace(**traits_of(header, path)._asdict())
 
@@ -113,11 +106,11 @@ def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussia
             coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
     # Shift and number of bits of each of three numbers in a word.
     eleven, ten, eight = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10)), ((24, 8), (16, 8), (8, 8))
-    return scene_of(
+    return coding.scene_of(
         between(_unpack(position, eleven), _BOUNDS[:6]),
         between(_unpack(scale, eleven), _BOUNDS[6:12]),
-        from_smallest_three((rotation >> 30).astype(np.int64), (_unpack(rotation, ten) - 0.5) * 2**0.5),
-        logits_of_bytes(color & 255),
+        coding.from_smallest_three((rotation >> 30).astype(np.int64), (_unpack(rotation, ten) - 0.5) * 2**0.5),
+        coding.logits_of_bytes(color & 255),
         (between(_unpack(color, eight), _BOUNDS[12:]) - 0.5) / SH_C0,
         coefficients,
     )

@@ -23,19 +23,8 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.formats.coding import (
-    Array,
-    bytes_of_logits,
-    damage_named,
-    from_smallest_three,
-    logits_of_bytes,
-    morton_order,
-    require_plausible,
-    scene_of,
-    smallest_three,
-    to_bytes,
-    unit_quats,
-)
+from pointsplat_ns.io.formats import coding
+from pointsplat_ns.io.formats.coding import Array
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
 from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
@@ -54,7 +43,7 @@ def read_sog(path: Path | str) -> Gaussians:
     has no number, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError if a part is missing or damaged, or
     declares more than it can hold."""
     path = Path(path)
-    with damage_named(path, "SOG"), closing(Images(path)) as images:
+    with coding.damage_named(path, "SOG"), closing(Images(path)) as images:
         return _decode(images, images.meta(), path)
 
 
@@ -76,21 +65,21 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     n = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
         raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
-    require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
+    coding.require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
     pixels = functools.partial(_pixels, images, n)
     low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
     logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / _LEVELS
     quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])
     tops = quats[:, 3].astype(np.int64) - 252  # alpha is this plus the index of the largest component
-    rotations = from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
+    rotations = coding.from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
     rotations[tops < 0] = (1, 0, 0, 0)  # as the viewers of this format do
     dc = _looked_up(meta["sh0"], colors, 3 if version == 2 else 4)
-    return scene_of(
+    return coding.scene_of(
         _of_logs(logs),
         _looked_up(meta["scales"], pixels(meta["scales"]), 3),
         rotations,
-        logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
+        coding.logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
         dc[:, :3],
         _read_sh(images, n, meta),
     ).replace(antialiased=meta.get("model") == "antialiased")
@@ -162,7 +151,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     if max(width, height) > MAX_SIDE:
         raise SceneError(f"{n} Gaussians; a SOG file holds at most {MAX_SIDE**2}")
     progress("packing attributes", 0.0)
-    scene = scene if ordered else scene[morton_order(scene)]
+    scene = scene if ordered else scene[coding.morton_order(scene)]
     images: dict[str, tuple[Array, int, int]] = {}
 
     def add(name: str, columns: Sequence[Array]) -> list[str]:
@@ -173,7 +162,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     steps = np.rint(levels).astype(np.int64)
     scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
-    largest, others = smallest_three(unit_quats(scene))
+    largest, others = coding.smallest_three(coding.unit_quats(scene))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "pointsplat-ns"},
@@ -184,10 +173,10 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
             "files": add("means_l.webp", [steps & 255]) + add("means_u.webp", [steps >> 8]),
         },
         "scales": {"codebook": _short(scales), "files": add("scales.webp", [scale_index.numpy()])},
-        "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), 252 + largest])},
+        "quats": {"files": add("quats.webp", [coding.to_bytes((others / 2**0.5 + 0.5) * 255), 252 + largest])},
         "sh0": {
             "codebook": _short(colors),
-            "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
+            "files": add("sh0.webp", [color_index.numpy(), coding.bytes_of_logits(scene)]),
         },
     }
     if scene.antialiased:

@@ -16,15 +16,7 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import require_file, require_memory
-from pointsplat_ns.io.formats.coding import (
-    bytes_of_logits,
-    damage_named,
-    logits_of_bytes,
-    scene_of,
-    shares_of_dc,
-    to_bytes,
-    unit_quats,
-)
+from pointsplat_ns.io.formats import coding
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -45,13 +37,13 @@ def read_splat(path: Path | str) -> Gaussians:
     if start and start.isascii() and start.decode().replace("\n", "").replace("\r", "").replace("\t", "").isprintable():
         raise SceneError(f"{path}: text ({start[:24]!r}...); expected the rows of a .splat file")
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
-    with damage_named(path, ".splat"):
+    with coding.damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
-        return scene_of(
+        return coding.scene_of(
             rows["means"],
             np.log(rows["stds"]),  # of zero -Inf, a flat axis; of a negative size NaN, which is dropped
             (rows["quats"].astype(np.float32) - 128) / 128,
-            logits_of_bytes(rows["rgba"][:, 3]),
+            coding.logits_of_bytes(rows["rgba"][:, 3]),
             (rows["rgba"][:, :3].astype(np.float32) / 255 - 0.5) / SH_C0,
             np.empty((len(rows), 0, 3)),
         )
@@ -73,7 +65,7 @@ def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
     rows["means"] = scene.means.numpy()
     # Readers drop infinite sizes.
     rows["stds"] = scene.stds.clamp_max(torch.finfo(torch.float32).max).numpy()
-    rows["rgba"][:, :3] = to_bytes(255 * shares_of_dc(scene))
-    rows["rgba"][:, 3] = bytes_of_logits(scene)
-    rows["quats"] = to_bytes(128 * unit_quats(scene) + 128)
+    rows["rgba"][:, :3] = coding.to_bytes(255 * coding.shares_of_dc(scene))
+    rows["rgba"][:, 3] = coding.bytes_of_logits(scene)
+    rows["quats"] = coding.to_bytes(128 * coding.unit_quats(scene) + 128)
     return rows.tobytes()

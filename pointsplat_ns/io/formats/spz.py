@@ -21,20 +21,8 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.io.files import logger, require_file
-from pointsplat_ns.io.formats.coding import (
-    Array,
-    Blocks,
-    bytes_of_logits,
-    damage_named,
-    from_smallest_three,
-    load_bytes,
-    logits_of_bytes,
-    require_plausible,
-    scene_of,
-    smallest_three,
-    to_bytes,
-    unit_quats,
-)
+from pointsplat_ns.io.formats import coding
+from pointsplat_ns.io.formats.coding import Array, Blocks
 from pointsplat_ns.io.formats.holding import Holds, Span, typical_sizes, within_colours
 from pointsplat_ns.io.formats.rounding import Rounding, rounded
 from pointsplat_ns.system.progress import Progress, silent
@@ -78,8 +66,8 @@ def read_spz(path: Path | str) -> Gaussians:
     file. Of SH degree 4, the highest band is left out, and extensions are not read, which is logged. Raises SceneError
     if the file is of another kind or version, is truncated, or declares more than it can hold."""
     path = require_file(path, "an SPZ file")
-    with damage_named(path, "SPZ"):
-        data = load_bytes(path)
+    with coding.damage_named(path, "SPZ"):
+        data = coding.load_bytes(path)
         if data[:2] == b"\x1f\x8b":
             head, parts = _parts_of_gzip(data, path)
         elif data[:4] == _MAGIC:
@@ -223,7 +211,7 @@ def _head(data: bytes, versions: tuple[int, ...], packed: int, path: Path) -> _H
         raise SceneError(
             f"{path}: {head.fraction_bits} bits after the point; expected at most {MAX_FRACTION_BITS} of 24"
         )
-    require_plausible(path, sum(head.sizes), packed, head.count, head.rest)
+    coding.require_plausible(path, sum(head.sizes), packed, head.count, head.rest)
     return head
 
 
@@ -267,11 +255,11 @@ def _decode(head: _Head, parts: list[bytes | memoryview]) -> Gaussians:
     n = head.count
     positions, alphas, colors, scales, quats, sh = (np.frombuffer(part, np.uint8) for part in parts)
     kept = min(head.rest, (MAX_SH_DEGREE + 1) ** 2 - 1)
-    return scene_of(
+    return coding.scene_of(
         _from_fixed_point(positions.reshape(n, 3, 3), head.fraction_bits),
         scales.reshape(n, 3).astype(np.float32) * np.float32(HOLDS.sizes.step) + np.float32(HOLDS.sizes.low),
         _quats_of_three(quats) if head.version == 2 else _quats_of_four(quats),
-        logits_of_bytes(alphas),
+        coding.logits_of_bytes(alphas),
         (colors.reshape(n, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE,
         (sh.reshape(n, head.rest, 3)[:, :kept].astype(np.float32) - 128) / 128,
     )
@@ -282,14 +270,14 @@ def _encode(scene: Gaussians, bits: int, sh_bits: tuple[int, int]) -> list[bytes
     bands = scene.features_rest[:, :3], scene.features_rest[:, 3:]  # degree 1, and those above
     first, other = (_coarse(rest.numpy(), kept) for rest, kept in zip(bands, sh_bits, strict=True))
     fixed = np.rint(np.ldexp(scene.means.double().numpy(), bits)).astype("<i4")
-    largest, others = smallest_three(unit_quats(scene)[:, _XYZW])
+    largest, others = coding.smallest_three(coding.unit_quats(scene)[:, _XYZW])
     magnitudes = np.rint(np.abs(others) * 2**0.5 * 511).astype(np.uint32) | (others < 0).astype(np.uint32) << 9
     words = largest.astype(np.uint32) << 30 | magnitudes[:, 0] << 20 | magnitudes[:, 1] << 10 | magnitudes[:, 2]
     return [
         np.ascontiguousarray(fixed[..., None]).view(np.uint8)[..., :3].tobytes(),
-        bytes_of_logits(scene).tobytes(),
-        to_bytes((scene.features_dc.double().numpy() * _COLOUR_SCALE + 0.5) * 255).tobytes(),
-        to_bytes((scene.scales.double() - HOLDS.sizes.low) / HOLDS.sizes.step).tobytes(),
+        coding.bytes_of_logits(scene).tobytes(),
+        coding.to_bytes((scene.features_dc.double().numpy() * _COLOUR_SCALE + 0.5) * 255).tobytes(),
+        coding.to_bytes((scene.scales.double() - HOLDS.sizes.low) / HOLDS.sizes.step).tobytes(),
         words.astype("<u4").tobytes(),
         np.concatenate([first, other], axis=1).tobytes(),
     ]
@@ -323,5 +311,5 @@ def _quats_of_four(packed: Array) -> Array:
     negative = np.stack([words >> shift & 512 for shift in (20, 10, 0)], axis=1) > 0
     others = np.where(negative, -levels, levels) * 0.5**0.5
     quats = np.empty((len(words), 4), np.float32)
-    quats[:, _XYZW] = from_smallest_three((words >> 30).astype(np.int64), others)
+    quats[:, _XYZW] = coding.from_smallest_three((words >> 30).astype(np.int64), others)
     return quats
