@@ -141,9 +141,11 @@ class PlyRows:
         encodings and elements after the Gaussians cannot cause errors. Raises SceneError if they are damaged."""
         from plyfile import PlyData, PlyParseError
 
+        require_memory(self.path, 2 * self.path.stat().st_size)
+        with failure_named(self.path, "read"):
+            text = self._header.up_to("vertex") + self.path.read_bytes()[self._header.size :]
         try:
-            with _GaussiansAlone(self.path, self._header) as stream:
-                return PlyData.read(stream)["vertex"].data
+            return PlyData.read(io.BytesIO(text))["vertex"].data
         except (PlyParseError, ValueError, OverflowError) as error:
             wanted = f"{self.count} Gaussians of {len(self._names)} numbers"
             raise SceneError(f"{self.path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
@@ -164,19 +166,6 @@ class PlyRows:
 
 def _doubles(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
-
-
-class _GaussiansAlone(io.FileIO):
-    """A PLY file whose header is another."""
-
-    def __init__(self, path: Path, header: Header):
-        super().__init__(path)
-        self.seek(header.size)
-        self._header = io.BytesIO(header.up_to("vertex"))
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Bytes of the header until it ends, then of the file."""
-        return self._header.read(size) or super().read(-1 if size is None else size)
 
 
 def _gaussian_element(header: Header, path: Path) -> Element:
