@@ -39,11 +39,10 @@ FOLDER_FILES = FolderFiles()
 
 
 def find_scenes(folder: Path | str) -> dict[str, Path]:
-    """Every scene below a folder by its name, sorted: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder. A name is the path below the folder without a
-    suffix: ``deep/room``, or ``room_ply`` beside ``room_spz``. Results of earlier commands are passed over: files of
-    the names that these give by default, and whole folders of results. Raises SceneError if there is no such folder, it
-    is a run, or there is no scene below it."""
+    """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their path below the folder
+    without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and the newest trained run of each experiment, by
+    the experiment's name. Results of earlier commands are passed over: files of the names that these give by default,
+    and whole folders of results. Raises SceneError if there is no such folder, it is a run, or there is no scene."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
@@ -56,7 +55,7 @@ def find_scenes(folder: Path | str) -> dict[str, Path]:
             files.remove(path)
     named = [(_stem(path.relative_to(folder)), path) for path in files]
     with suppress(SceneError):  # no run; those passed over have been named
-        named += [(_name_below(folder, run), run.folder) for run in find_runs(folder)]
+        named += [(scene_name(run), run.folder) for run in find_runs(folder)]
     if not named:
         raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
     counts = Counter(name for name, _ in named)
@@ -179,15 +178,6 @@ def _stem(path: Path) -> str:
     """The path of a scene's file without the suffix of its format, such as ``.compressed.ply``."""
     kind = format_named(path.name)
     return path.as_posix()[: -len(path.suffix if kind is None else kind.suffix)]
-
-
-def _name_below(folder: Path, run: Run) -> str:
-    """The path from a folder to a run's experiment; the scene's name if that does not lie below the folder."""
-    try:
-        name = _experiment_folder(run).relative_to(folder.resolve()).as_posix()
-    except ValueError:
-        return scene_name(run)
-    return scene_name(run) if name == "." else name
 
 
 def _experiment_folder(run: Run) -> Path:

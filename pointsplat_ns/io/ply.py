@@ -20,19 +20,27 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits, sh_degree_of
 from pointsplat_ns.io.files import failure_named, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
-from pointsplat_ns.io.ply_dialects import COLUMNS, FILTER, attributes_of, columns_of, is_flat
 from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.system.pieces import CHUNK
+
+COLUMNS = {
+    "means": ["x", "y", "z"],
+    "normals": ["nx", "ny", "nz"],
+    "features_dc": ["f_dc_0", "f_dc_1", "f_dc_2"],
+    "opacities": ["opacity"],
+    "scales": ["scale_0", "scale_1", "scale_2"],
+    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+}
+"""Vertex properties of the attributes; normals are written as zeros and not read."""
 
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
-    Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of names, and Mip-Splatting's
-    3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties and elements are not read; a
-    warning says so.
+    Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of names are understood. Other
+    properties and elements are not read; a warning says so.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -71,10 +79,9 @@ class PlyRows:
         if warn:
             _report_unread(header, vertex, self._in_file > self.rest, path)
         self._dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
-        self._names = self._dtype.names or ()
+        self._scales = [name for name in COLUMNS["scales"] if name in (self._dtype.names or ())]
         self._start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        traits = traits_of(header, path)  # who trained with Mip-Splatting's 3D filter trained with antialiasing
-        self.traits = traits._replace(antialiased=traits.antialiased or FILTER in self._names)
+        self.traits = traits_of(header, path)
         self._shift: Offset | None = None
         if vertex.count and any(self._dtype[name].newbyteorder("=") == np.float64 for name in "xyz"):
             self._shift_positions(warn)
@@ -104,8 +111,10 @@ class PlyRows:
 
         # Channel-major in the file, channel last in a scene.
         rest = [f"f_rest_{channel * self._in_file + i}" for i in range(self.rest) for channel in range(3)]
-        columns = columns_of(self._names) | {"features_rest": rest}
-        tables = {name: np.empty((len(rows), len(fields)), np.float32) for name, fields in columns.items()}
+        columns = {name: COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")}
+        columns["features_rest"] = rest
+        tables = {name: np.full((len(rows), len(fields)), -np.inf, np.float32) for name, fields in columns.items()}
+        columns["scales"] = self._scales  # of 2D Gaussians the last stays -Inf: a flat axis
         at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
         # A double beyond float32 becomes Inf and is dropped with the others.
         with np.errstate(over="ignore"), failure_named(self.path, "read"), self.path.open("rb") as stream:
@@ -116,8 +125,8 @@ class PlyRows:
                     tables["means"][chunk] = _doubles(values, COLUMNS["means"]) - self._shift
                 for name, fields in columns.items():
                     if fields and not (name == "means" and self._shift is not None):
-                        tables[name][chunk] = structured_to_unstructured(values[fields], np.float32)
-        tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, self._names).items()}
+                        tables[name][chunk, : len(fields)] = structured_to_unstructured(values[fields], np.float32)
+        tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
         tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), self.rest, 3)
         return Gaussians(**tensors, **self.traits._asdict())
 
@@ -147,15 +156,14 @@ class PlyRows:
         try:
             return PlyData.read(io.BytesIO(text))["vertex"].data
         except (PlyParseError, ValueError, OverflowError) as error:
-            wanted = f"{self.count} Gaussians of {len(self._names)} numbers"
+            wanted = f"{self.count} Gaussians of {len(self._vertex.properties)} numbers"
             raise SceneError(f"{self.path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
 
     def _shift_positions(self, warn: bool) -> None:
         """Subtract an offset from positions that float32 would round too far, which is logged if ``warn``."""
         with failure_named(self.path, "read"), self.path.open("rb") as stream:
             rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
-        scales = [name for name in COLUMNS["scales"] if name in self._names]
-        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, scales))
+        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, self._scales))
         if self._shift is not None:
             x, y, z = (a + b for a, b in zip(self.traits.offset or (0.0, 0.0, 0.0), self._shift, strict=True))
             self.traits = self.traits._replace(offset=(x, y, z))
@@ -195,9 +203,7 @@ def _report_unread(header: Header, vertex: Element, higher: bool, path: Path) ->
     """Warn of what a file holds beside the Gaussians that are read."""
     if higher:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-    known = {FILTER, *(name for names in COLUMNS.values() for name in names)}
-    if any(name == FILTER for name, _ in vertex.properties):
-        logger.info("%s: Mip-Splatting's 3D filter is put into sizes and opacities", path)
+    known = {name for names in COLUMNS.values() for name in names}
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
     unread += [f"the element {element.name!r}" for element in header.elements if element != vertex and element.count]
@@ -218,7 +224,12 @@ def _num_rest(vertex: Element, path: Path) -> int:
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
-    if is_flat(present):
+    if "filter_3D" in present:
+        raise SceneError(
+            f"{path}: Mip-Splatting's 3D filter lies beside the sizes (property 'filter_3D'); expected both fused, as "
+            "its create_fused_ply.py writes them"
+        )
+    if "scale_2" not in present and {"scale_0", "scale_1", "opacity"} <= present:
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))

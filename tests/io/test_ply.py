@@ -10,11 +10,13 @@ import psutil
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from plys import columns_of, write_columns
 from refusing import fails as refused
 
 from making import normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_ply, read_scene, write_ply
+from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.ply import column_names
 
 
@@ -162,6 +164,7 @@ def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
         ("vertex", columns("f_rest_44", "f_rest_43"), ["has 43 f_rest properties", "0, 9, 24, 45 or 72"]),
         ("vertex", [*columns()[:3], ("red", "u1")], ["lacks the vertex property 'f_dc_0' and 10 more"]),
         ("vertex", [("packed_position", "u4"), ("packed_rotation", "u4")], ["compressed PLY", "expected a plain one"]),
+        ("vertex", [*columns(), ("filter_3D", "f4")], ["expected both fused, as its create_fused_ply.py writes them"]),
         ("point", columns()[:1], ["no element 'vertex' (found point)"]),
     ],
     ids=str,
@@ -242,3 +245,17 @@ def test_every_line_end_and_spaces_after_the_last_keyword_are_read(tmp_path, new
     header = (header + end + b"\n").replace(b"\n", newline)
     (tmp_path / "b.ply").write_bytes(header + (data.replace(b"\n", newline) if text else data))
     assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
+def test_names_with_prefixes_of_cloudcompare_are_read_to_the_bit(tmp_path, prefix, text, caplog):
+    scene = normal_scene(6, 2)
+    plain = {"x", "y", "z", "nx", "ny", "nz"}
+    found = {name if name in plain else prefix + name: array for name, array in columns_of(scene).items()}
+    # A name that is there with and without a prefix is read without.
+    more = {"opacity": found.pop(f"{prefix}opacity"), f"{prefix}opacity": np.zeros(6, np.float32)}
+    path = write_columns(tmp_path / "a.ply", {**found, **more, "red": np.zeros(6, "u1")}, text)
+    assert same_bits(read_ply(path), scene)
+    assert f"not read: the vertex properties {prefix}opacity, red" in caplog.text
+    assert [*find_scenes(tmp_path).values()] == [path]

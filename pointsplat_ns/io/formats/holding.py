@@ -19,9 +19,6 @@ from pointsplat_ns.io.formats.rounding import weights
 from pointsplat_ns.io.offsets import offset_text
 from pointsplat_ns.system.tensors import DOUBLES
 
-_REPORTED = 0.01
-"""Share of the Gaussians that lose something, by number or by weight in pictures, above which a loss is reported."""
-
 _DARKEST = (-0.44 - 0.5) / SH_C0
 """Constant SH coefficient that black need not fall below."""
 
@@ -66,7 +63,7 @@ class Holds:
 
 def losses(scene: Gaussians, holds: Holds) -> list[str]:
     """What a scene, float32 on the CPU, loses in a format: a clause with numbers for each attribute, none where the
-    format holds it."""
+    format holds it, or at most 1 % of the Gaussians lose something, by their weight in pictures."""
     found = []
     if scene.antialiased and not holds.antialiased:
         found.append("the mark of antialiased training")
@@ -79,14 +76,11 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
     if holds.position_steps is not None:
         steps = holds.position_steps(fitted).double()
         times = float((steps / typical_sizes(fitted)).median())
-        misplaced = _share(steps > fitted.scales.double().amax(dim=1).exp(), fitted)
         if times > 0.25:  # at a quarter, renders have about 42 to 52 dB
             found.append(
                 f"positions are rounded to {float(steps.median()):.2g} units, {times:.2g} times the median size of a "
                 "Gaussian"
             )
-        elif misplaced > 0.0025:  # real splats have at most 0.0004
-            found.append(f"positions of {_percent(misplaced)} of the Gaussians are rounded by more than their size")
     ordered, sizes = scene.scales.sort(dim=1).values, holds.sizes
     drawn = scene.replace(scales=scene.scales.clamp_min(sizes.low))  # as large as the smallest become
     found += _cut(ordered[:, 1] < sizes.low, drawn, "smaller", sizes.low, "larger")
@@ -94,8 +88,8 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
     if holds.sh is None and scene.sh_degree:
         found.append(f"SH of degree {scene.sh_degree} are left out, so colours no longer change with the view")
     error = _colour_errors(scene, fitted, holds)
-    share = _share(error > 0.2, scene)
-    if share > _REPORTED:
+    share = max(float((error > 0.2).double().mean()), _weight(error > 0.2, scene))
+    if share > 0.01:
         found.append(
             f"{_percent(share)} of the Gaussians have colours outside of its range, by {float(error.max()):.2g} of "
             "white at most"
@@ -197,15 +191,10 @@ def _colour_errors(scene: Gaussians, fitted: Gaussians, holds: Holds) -> Tensor:
 
 
 def _cut(mask: Tensor, scene: Gaussians, than: str, limit: float, drawn: str) -> list[str]:
-    if _weight(mask, scene) <= _REPORTED:
+    if _weight(mask, scene) <= 0.01:
         return []
     count = _percent(float(mask.double().mean()))
     return [f"{count} of the Gaussians are {than} than {math.exp(limit):.2g} units and become {drawn}"]
-
-
-def _share(mask: Tensor, scene: Gaussians) -> float:
-    """The share of Gaussians, by number or by weight, whichever is larger."""
-    return max(float(mask.double().mean()), _weight(mask, scene))
 
 
 def _weight(mask: Tensor, scene: Gaussians) -> float:
