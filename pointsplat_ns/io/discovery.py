@@ -40,9 +40,9 @@ FOLDER_FILES = FolderFiles()
 
 def find_scenes(folder: Path | str) -> dict[str, Path]:
     """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their path below the folder
-    without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and the newest trained run of each experiment, by
-    the experiment's name. Results of earlier commands are passed over: files of the names that these give by default,
-    and whole folders of results. Raises SceneError if there is no such folder, it is a run, or there is no scene."""
+    without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and the newest trained run of each experiment,
+    by the experiment's name. Results of earlier commands are passed over: files of the names that these give by
+    default, and whole folders. Raises SceneError if there is no such folder, it is a run, or there is no scene."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")

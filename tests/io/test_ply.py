@@ -5,7 +5,6 @@ import os
 from unittest import mock
 
 import numpy as np
-import numpy.lib.recfunctions
 import psutil
 import pytest
 import torch
@@ -58,18 +57,10 @@ def test_no_infinite_value_is_read_or_written_and_what_is_drawn_stays(tmp_path, 
 @pytest.mark.parametrize("text", [False, True])
 def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
     scene = normal_scene(5, 1)
-    write_ply(scene, tmp_path / "a.ply")
-    rows = rows_of(tmp_path / "a.ply")
-    order = [*reversed(rows.dtype.names), "red", "weight"]
-    kinds = {"red": "u1", "weight": "f8", "x": "f8"}
-    mixed = np.zeros(5, [(name, kinds.get(name, "f4")) for name in order])
-    for name in rows.dtype.names:
-        mixed[name] = rows[name]
+    columns = dict(reversed(columns_of(scene).items())) | {"red": np.zeros(5, "u1"), "weight": np.zeros(5)}
+    columns["x"] = columns["x"].astype(np.float64)
     before = PlyElement.describe(np.zeros(3, [("a", "i4"), ("b", "u1")]), "camera")
-    after = PlyElement.describe(np.array([([1, 2, 3],)], [("vertex_indices", "O")]), "face")
-    elements = [before, PlyElement.describe(mixed, "vertex"), after]
-    PlyData(elements, text=text, byte_order="<").write(str(tmp_path / "b.ply"))
-    assert same_bits(scene, read_ply(tmp_path / "b.ply"))
+    assert same_bits(scene, read_ply(write_columns(tmp_path / "a.ply", columns, text, before=[before])))
 
 
 def test_a_sparse_file_that_would_fill_the_memory_is_refused(tmp_path):
@@ -92,16 +83,11 @@ def test_what_a_gaussian_has_no_place_for_is_said(tmp_path, caplog):
     path, scene = tmp_path / "a.ply", normal_scene(5, 1)
     write_ply(scene, path)
     assert same_bits(scene, read_ply(path)) and not caplog.records
-    rows = rows_of(path)
-    extra = numpy.lib.recfunctions.append_fields(rows, ["red", "class"], [np.zeros(5, "u1"), np.ones(5, "i4")])
-    rewrite(path, extra.data)
-    assert same_bits(scene, read_ply(path))
-    assert caplog.messages == [f"{path}: not read: the vertex properties red, class"]
-    caplog.clear()
     faces = PlyElement.describe(np.zeros(2, [("area", "f4")]), "face")
-    PlyData([PlyElement.describe(rows, "vertex"), faces]).write(str(path))
+    more = {"red": np.zeros(5, "u1"), "class": np.ones(5, "i4")}
+    write_columns(path, columns_of(scene) | more, before=[faces])
     assert same_bits(scene, read_ply(path))
-    assert caplog.messages == [f"{path}: not read: the element 'face'"]
+    assert caplog.messages == [f"{path}: not read: the vertex properties red, class; the element 'face'"]
 
 
 @pytest.mark.parametrize(
@@ -149,9 +135,8 @@ def columns(*without):
 
 def test_2d_gaussians_are_read_as_flat_ones(tmp_path, caplog):
     scene = normal_scene(20_000, 1)  # more than one chunk
-    write_ply(scene, tmp_path / "a.ply")
-    rewrite(tmp_path / "flat.ply", numpy.lib.recfunctions.drop_fields(rows_of(tmp_path / "a.ply"), "scale_2"))
-    flat = read_scene(tmp_path / "flat.ply")
+    found = {name: array for name, array in columns_of(scene).items() if name != "scale_2"}
+    flat = read_scene(write_columns(tmp_path / "flat.ply", found))
     assert "2D Gaussians" in caplog.text and "scale_2" in caplog.text
     assert torch.equal(flat.scales[:, :2], scene.scales[:, :2]) and float(flat.stds[:, 2].max()) < 1e-30
     assert torch.equal(flat.quats, scene.quats) and torch.equal(flat.features_rest, scene.features_rest)
@@ -197,11 +182,9 @@ def test_an_absurd_count_is_refused_before_memory_is_taken(tmp_path, form, eleme
     [
         ("element vertex -5", "line 3 is not understood: 'element vertex -5'"),
         ("element vertex 1\nproperty quad x", "line 4 is not understood: 'property quad x'"),
-        ("property float x", "line 3 is not understood"),
         ("element vertex 1\nproperty float x\nproperty float x", "declares vertex property 'x' twice"),
         ("element vertex 1\nelement vertex 1", "declares element 'vertex' twice"),
         ("element vertex 1\nproperty list uchar int lists", "vertex property 'lists' is a list"),
-        ("rubbish", "line 3 is not understood: 'rubbish'"),
         (None, "names no format"),
     ],
 )
@@ -216,7 +199,6 @@ def test_a_damaged_header_line_is_quoted(tmp_path, line, fragment):
     [
         (lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0] + "\n"], "row 2: property 'rot_3': early end-of-line"),
         (lambda lines: [*lines[:-1], "what " + lines[-1].split(" ", 1)[1]], "row 2: property 'x': malformed input"),
-        (lambda lines: [*lines[:-1], lines[-1].rstrip() + " 1\n"], "row 2: expected end-of-line"),
         (lambda lines: lines[:-1], "row 2: early end-of-file"),
     ],
 )
@@ -226,11 +208,6 @@ def test_damaged_ascii_is_said_with_its_row(tmp_path, damage, fragment):
     lines = (tmp_path / "b.ply").read_text().splitlines(keepends=True)
     (tmp_path / "b.ply").write_text("".join(damage(lines)))
     fails(tmp_path / "b.ply", "damaged PLY", fragment, "expected 3 Gaussians of 17 numbers")
-
-
-def test_no_file_and_a_folder_are_said(tmp_path):
-    fails(tmp_path / "none.ply", "no such file")
-    fails(tmp_path, "not a regular file")
 
 
 @pytest.mark.parametrize(

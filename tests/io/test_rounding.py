@@ -99,21 +99,13 @@ def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
     assert same_bits(read_ply(tmp_path / "a.ply"), scene)
 
 
-def test_rows_are_refused_as_whole_files_are_and_when_a_file_shrinks(tmp_path):
+def test_rows_of_a_file_that_shrinks_are_refused(tmp_path):
     write_ply(cloud(50), tmp_path / "a.ply")
-    data = (tmp_path / "a.ply").read_bytes()
     rows = ply.PlyRows.open(tmp_path / "a.ply")
     assert rows is not None
-    (tmp_path / "a.ply").write_bytes(data[:-9])
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
     with pytest.raises(SceneError, match="truncated while it was read; expected 50 Gaussians"):
         rows.read(40, 50)
-    with pytest.raises(SceneError, match="declares 50 Gaussians of .* the file holds 49"):
-        ply.PlyRows.open(tmp_path / "a.ply")
-    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 50", b"vertex 1000000000000000"))
-    with pytest.raises(SceneError, match="declares 1000000000000000 Gaussians"):
-        ply.PlyRows.open(tmp_path / "a.ply")
-    with pytest.raises(SceneError, match="no such file"):
-        ply.PlyRows.open(tmp_path / "b.ply")
 
 
 def rows_of(n, dims, seed=0):
