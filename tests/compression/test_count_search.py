@@ -20,7 +20,7 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
-from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
+from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.pruning import METHODS, cut_sh, score_of, select
 
@@ -155,7 +155,7 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     }
     for half, one in found.items():
         wanted = rounding_for(few_psnr(psnr_of(half, one.scene), len(one.scene) / 4000), full.sh_degree)
-        assert one.limit.rounding.tolerance == pytest.approx(wanted.tolerance)
+        assert one.limit.rounding == pytest.approx(wanted)
     assert len(found[25.0].scene) > 1.1 * len(found[35.0].scene)
     for one in found.values():
         small = one.limit.rounded(one.scene)
@@ -173,7 +173,7 @@ def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
 
 
 def test_a_scene_is_rounded_as_far_as_its_size_needs():
-    scene, kind, usual = cloud(2000), format_to_write(".spz"), Rounding(0.002)
+    scene, kind, usual = cloud(2000), format_to_write(".spz"), 0.002
     size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
     for most in (int(0.9 * size), size, int(1.05 * size)):
         found = FileLimit(kind, most, usual).bytes_of(FileLimit(kind, most, usual).rounded(scene))

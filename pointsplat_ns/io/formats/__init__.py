@@ -20,7 +20,6 @@ from pointsplat_ns.io.files import failure_named, one_line, replacing
 from pointsplat_ns.io.formats import sog, splat, spz
 from pointsplat_ns.io.formats.compressed_ply import is_compressed, read_compressed_ply
 from pointsplat_ns.io.formats.holding import Holds
-from pointsplat_ns.io.formats.rounding import Rounding
 from pointsplat_ns.io.formats.sog import encode_sog, read_sog, rounded_for_sog
 from pointsplat_ns.io.formats.sog_images import SOG_META
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
@@ -52,8 +51,8 @@ class Format:
     if it depends on more."""
     encode: Callable[[Gaussians, Progress], bytes] | None = None
     """The bytes of a file of a scene, where only they tell its size."""
-    rounded: Callable[[Gaussians, Rounding], Gaussians] | None = None
-    """A scene whose numbers are rounded, so that a file of it is smaller."""
+    rounded: Callable[[Gaussians, float], Gaussians] | None = None
+    """A scene whose numbers are rounded, so that a file of it is smaller, by a tolerance (see :mod:`rounding`)."""
     capacity: Holds = Holds()
     """The range and the step of each attribute in its files."""
 

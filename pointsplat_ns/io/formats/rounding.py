@@ -52,22 +52,11 @@ class RoundingSettings:
 ROUNDING = RoundingSettings()
 
 
-@dataclass(frozen=True)
-class Rounding:
-    """How far the numbers of a scene are rounded."""
-
-    tolerance: float
-    """Error of the colour of a Gaussian of usual weight, as a share of the colour range; 0 for no rounding."""
-
-    def finer(self, steps: float) -> Rounding:
-        """So many steps finer, each with half of the squared error; coarser where ``steps`` is negative."""
-        return Rounding(self.tolerance * 2 ** (-0.5 * steps))
-
-
-def rounding_for(psnr: float, sh_degree: int) -> Rounding:
-    """The rounding of a scene of some PSNR, dB, and SH degree."""
+def rounding_for(psnr: float, sh_degree: int) -> float:
+    """The rounding of a scene of some PSNR, dB, and SH degree: its tolerance, the error of the colour of a Gaussian of
+    usual weight, as a share of the colour range."""
     share = ROUNDING.share if sh_degree else ROUNDING.share_without_sh
-    return Rounding(share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20))
+    return share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20)
 
 
 class Steps(NamedTuple):
@@ -104,12 +93,12 @@ def steps_of(scene: Gaussians, tolerance: float) -> Steps:
     )
 
 
-def rounded(scene: Gaussians, rounding: Rounding) -> Gaussians:
+def rounded(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene of N usable Gaussians, float32 on the CPU, of which every number is a multiple of the largest power of
-    two that its step allows."""
-    if not rounding.tolerance or not len(scene):
+    two that its step allows, for a tolerance above 0 of a Gaussian of usual weight."""
+    if not len(scene):
         return scene
-    steps = steps_of(scene, rounding.tolerance)
+    steps = steps_of(scene, tolerance)
     return rounded_shapes(scene, steps).replace(
         means=multiples(scene.means.double(), steps.means).float(),
         features_rest=multiples(scene.features_rest.double(), steps.sh[:, None]).float(),

@@ -27,7 +27,7 @@ from pointsplat_ns.io.formats import coding
 from pointsplat_ns.io.formats.coding import Array
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
+from pointsplat_ns.io.formats.rounding import ROUNDING, multiples, rounded_shapes, steps_of, weights
 from pointsplat_ns.io.formats.sog_images import SOG_META, Images, webp
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -215,19 +215,18 @@ def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
 HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1))
 
 
-def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
+def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SOG: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), and
-    its SH above degree 0 are entries of a palette. Arguments as of
-    :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
-    if not rounding.tolerance or not len(scene):
+    its SH above degree 0 are entries of a palette. A tolerance of 0 leaves it."""
+    if not tolerance or not len(scene):
         return scene
-    steps = steps_of(scene, rounding.tolerance)
+    steps = steps_of(scene, tolerance)
     levels, mins, maxs, of_level = _levels_of(scene)
     coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
     outermost = (levels <= 0) | (levels >= _LEVELS)  # they stay, so that levels keep their meaning
     logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, _LEVELS)) / _LEVELS
     means = torch.from_numpy(_of_logs(logs)).float()
-    rest = _few_sh(scene, rounding.tolerance) if scene.sh_degree else scene.features_rest
+    rest = _few_sh(scene, tolerance) if scene.sh_degree else scene.features_rest
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
 
 

@@ -24,7 +24,7 @@ from pointsplat_ns.io.files import logger, require_file
 from pointsplat_ns.io.formats import coding
 from pointsplat_ns.io.formats.coding import Array, Blocks
 from pointsplat_ns.io.formats.holding import Holds, Span, typical_sizes, within_colours
-from pointsplat_ns.io.formats.rounding import Rounding, rounded
+from pointsplat_ns.io.formats.rounding import rounded
 from pointsplat_ns.system.progress import Progress, silent
 
 FRACTION_BITS, MAX_FRACTION_BITS = 12, 23
@@ -108,12 +108,12 @@ def encode_spz(scene: Gaussians, progress: Progress = silent, level: int = 9) ->
     return b"".join([*packed, packer.flush()])
 
 
-def rounded_for_spz(scene: Gaussians, rounding: Rounding) -> Gaussians:
-    """A scene that takes fewer bytes as SPZ: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), those
-    of SH to at most 8 bits. Arguments as of :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
-    small = rounded(fitted(scene)[0], rounding) if rounding.tolerance else scene
-    if small is scene:
+def rounded_for_spz(scene: Gaussians, tolerance: float) -> Gaussians:
+    """A scene that takes fewer bytes as SPZ: its numbers are rounded as by
+    :func:`~pointsplat_ns.io.formats.rounding.rounded`, those of SH to at most 8 bits. A tolerance of 0 leaves it."""
+    if not tolerance or not len(scene):
         return scene
+    small = rounded(fitted(scene)[0], tolerance)
     return small.replace(features_rest=(128 * small.features_rest).round().clamp(-128, 127) / 128)
 
 
