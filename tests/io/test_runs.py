@@ -34,7 +34,7 @@ def test_a_run_of_nerfstudio_is_read_whole(make_run, tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    ["{", '{"scale": 1}', '{"transform": [[1, 0], [0, 1]], "scale": 1}', '{"transform": "no", "scale": 1}',
+    ['{"scale": 1}', '{"transform": [[1, 0], [0, 1]], "scale": 1}', '{"transform": "no", "scale": 1}',
      json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 0}),
      json.dumps({"transform": [[float("nan")] * 4] * 3, "scale": 1}),
      json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 1, "note": "x" * 100_000})],
