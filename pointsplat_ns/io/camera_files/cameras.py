@@ -21,9 +21,6 @@ from pointsplat_ns.views import Views
 MOST_CAMERAS = 100_000
 """Largest number of cameras in a file."""
 
-_DEVIATION = 1e-3
-"""Largest deviation of a rotation; text of four digits has less."""
-
 
 class Camera(NamedTuple):
     """One camera as a file has it, unchecked."""
@@ -118,9 +115,10 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
     """
     turn = values[:, :3, :3]
     off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype, device="cpu")).abs().amax((1, 2))
-    good = values.isfinite().all(2).all(1) & (off <= _DEVIATION) & (torch.linalg.det(turn) > 0)  # NaN fails too
+    most = 1e-3  # text of four digits is off by less
+    good = values.isfinite().all(2).all(1) & (off <= most) & (torch.linalg.det(turn) > 0)  # NaN fails too
     if values.shape[1] == 4:
-        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= _DEVIATION).all(1)
+        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= most).all(1)
     if not bool(good.all()):
         camera = f" of camera {_first_bad(good, names)}" if names else ""
         raise DataError(
