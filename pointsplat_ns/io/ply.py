@@ -128,7 +128,8 @@ class PlyRows:
                         tables[name][chunk, : len(fields)] = structured_to_unstructured(values[fields], np.float32)
         tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
         tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), self.rest, 3)
-        return Gaussians(**tensors, **self.traits._asdict())
+        antialiased, up, offset = self.traits
+        return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
 
     def _rows(self, stream: io.BufferedReader, numbers: Sequence[int]) -> np.ndarray:
         """Rows of these numbers. Raises SceneError if the file has become shorter."""

@@ -29,8 +29,8 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     or a camera has no focal length (a panorama)."""
     frames = content["frames"]
     need_count(path, len(frames))
-    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model")
-    names += ("k1", "k2", "k3", "k4", "p1", "p2")
+    distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *distortion)
     found = []
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):

@@ -6,8 +6,9 @@ import functools
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -80,6 +81,7 @@ class Images:
 
     def _bytes(self, name: str, most: int) -> bytes:
         """The content of one part, which must not exceed ``most`` bytes."""
+        opened: Callable[[], IO[bytes]]
         if self._zip is None:
             part = require_file(self._folder / name, "a part of a SOG folder")
             size, opened = part.stat().st_size, functools.partial(part.open, "rb")

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,7 +41,8 @@ _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _XYZW = np.array([1, 2, 3, 0])  # SPZ has w last
 
 
-class _Head(NamedTuple):
+@dataclass(frozen=True)
+class _Head:
     version: int
     count: int
     degree: int
@@ -124,6 +125,7 @@ def fitted(scene: Gaussians) -> tuple[Gaussians, str]:
     the median position and shrink in proportion: from there they look the same. Colours are as of
     :func:`within_colours`.
     """
+    assert HOLDS.sh is not None
     scene = within_colours(scene, HOLDS.colours, HOLDS.sh)
     if not len(scene):
         return scene, ""
