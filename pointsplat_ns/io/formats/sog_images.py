@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -81,18 +79,17 @@ class Images:
 
     def _bytes(self, name: str, most: int) -> bytes:
         """The content of one part, which must not exceed ``most`` bytes."""
-        opened: Callable[[], IO[bytes]]
         if self._zip is None:
             part = require_file(self._folder / name, "a part of a SOG folder")
-            size, opened = part.stat().st_size, functools.partial(part.open, "rb")
+            size = part.stat().st_size
         else:
             entries = [entry for entry in self._zip.infolist() if PurePosixPath(entry.filename).name == name]
             if len(entries) != 1:
                 raise SceneError(f"{self.path}: holds {len(entries)} files called {name}; expected one")
-            size, opened = entries[0].file_size, functools.partial(self._zip.open, entries[0])
+            size = entries[0].file_size
         if size > most:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
-        with opened() as stream:
+        with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
             return stream.read(most + 1)  # the size in the archive may be a lie
 
 
