@@ -24,7 +24,7 @@ from lab.common.printing import start as run_program
 from pointsplat_ns.errors import PointSplatError, need
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
-from pointsplat_ns.io.outputs import need_folder
+from pointsplat_ns.io.files import need_folder
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.looking.poses import look_at, views_of

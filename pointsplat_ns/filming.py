@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pointsplat_ns.api import Source, load
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.formats import coarser_levels
+from pointsplat_ns.io.formats.sog_stream import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource

@@ -34,6 +34,9 @@ from pointsplat_ns.io.files import (
     content_hash,
     json_text,
     logger,
+    need_folder,
+    need_new,
+    need_suffix,
     one_line,
     read_text,
     replacing,
@@ -42,7 +45,6 @@ from pointsplat_ns.io.files import (
     write_json,
 )  # fmt: skip
 from pointsplat_ns.io.formats import format_like, format_to_write
-from pointsplat_ns.io.outputs import need_folder, need_new, need_suffix
 from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source

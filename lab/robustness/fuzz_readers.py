@@ -261,9 +261,9 @@ def _colmap(suffix: str) -> Callable[[Path], None]:
 
 
 def _poses_in_folder(path: Path) -> object:
-    from pointsplat_ns.io.camera_files import read_views
+    from pointsplat_ns.io.camera_files import read_named_views
 
-    return read_views(path.parent)
+    return read_named_views(path.parent)
 
 
 def _replica(folder: Path) -> None:
@@ -288,7 +288,7 @@ READERS |= {
     "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
     "dataset": at("data/transforms.json", _use_dataset, _run),
-    "camera-json": at("a.json", "pointsplat_ns.io.camera_files:read_views", _transforms),
+    "camera-json": at("a.json", "pointsplat_ns.io.camera_files:read_named_views", _transforms),
     "colmap-cameras": at("cameras.bin", _poses_in_folder, _colmap("bin")),
     "colmap-images": at("images.bin", _poses_in_folder, _colmap("bin")),
     "colmap-cameras-text": at("cameras.txt", _poses_in_folder, _colmap("txt")),

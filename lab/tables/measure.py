@@ -29,8 +29,7 @@ from lab.tables.ways import PROTOCOL, WAYS, Way, cell_key
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger
-from pointsplat_ns.io.outputs import need_folder
+from pointsplat_ns.io.files import logger, need_folder
 from pointsplat_ns.io.runs import may_be_run, name_of, open_run
 from pointsplat_ns.io.scene import source_file
 from pointsplat_ns.metrics import MOST_PSNR

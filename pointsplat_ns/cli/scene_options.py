@@ -110,9 +110,9 @@ def need_one_scene(path: Path) -> None:
 def check_outputs(scene: Path | None, force: bool, png: Path | None = None, html: Path | None = None) -> None:
     """Check the files that a command is going to write (a scene of any writable format, a picture, a page) before its
     long computations. Raises SceneError if a path has another suffix, or as
-    :func:`~pointsplat_ns.io.outputs.need_writable`."""
+    :func:`~pointsplat_ns.io.files.need_writable`."""
+    from pointsplat_ns.io.files import need_suffix, need_writable
     from pointsplat_ns.io.formats import format_to_write
-    from pointsplat_ns.io.outputs import need_suffix, need_writable
 
     if scene is not None:
         format_to_write(scene)

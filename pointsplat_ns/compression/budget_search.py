@@ -18,7 +18,7 @@ import torch
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format
-from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
+from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.system.progress import silent
 
 SLOPE = 6.0
@@ -127,8 +127,8 @@ class FileLimit:
     """A format with ``encode``."""
     most: float
     """Bytes; inf for a rounding without a limit."""
-    rounding: Rounding | None = None
-    """The rounding of a scene of this quality; None for none, as long as the file meets the limit."""
+    rounding: float | None = None
+    """That of :func:`rounding_for` for a scene of this quality; None for none, as long as the file meets the limit."""
 
     def bytes_of(self, scene: Gaussians) -> int:
         """Bytes of a scene's file, without unusable Gaussians."""
@@ -150,7 +150,7 @@ class FileLimit:
             return best.to(scene.device)
         steps, fits, exceeds = 0.0, -math.inf, math.inf  # steps finer: those tried, the most that fit, the next
         for number in range(6):
-            tried = self.kind.rounded(written, rounding.finer(steps)) if number else tried
+            tried = self.kind.rounded(written, rounding * 2 ** (-0.5 * steps)) if number else tried
             room = math.log(self.most / self.bytes_of(tried))
             if room >= 0:
                 best, fits = tried, steps

@@ -6,8 +6,7 @@ Every reader returns a :class:`~pointsplat_ns.gaussians.Gaussians` and raises
 
 from pointsplat_ns.io.discovery import find_runs
 from pointsplat_ns.io.files import content_hash
-from pointsplat_ns.io.ply import read_ply
-from pointsplat_ns.io.ply_writing import write_ply
+from pointsplat_ns.io.ply import read_ply, write_ply
 from pointsplat_ns.io.runs import Run, open_run, scene_name
 from pointsplat_ns.io.scene import read_scene, save
 from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints, read_checkpoint

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -37,33 +38,30 @@ class FolderFiles:
 FOLDER_FILES = FolderFiles()
 
 
-RESULT_ENDS = ("_pruned", "_compact", "_web", "_phone", "_headset", "_email")
-"""Ends of the names that commands give their results beside a scene."""
-
-
 def find_scenes(folder: Path | str) -> dict[str, Path]:
-    """Every scene below a folder by its name, sorted: files that hold Gaussians, and the newest trained run of each
-    experiment, which has the name of the experiment's folder. A name is the path below the folder without a
-    suffix: ``deep/room``, or ``room_ply`` beside ``room_spz``. Results of earlier commands are passed over: files of
-    the names that these give by default, and whole folders of results. Raises SceneError if there is no such folder, it
-    is a run, or there is no scene below it."""
+    """Every scene below a folder by its name, sorted: files that hold Gaussians, named by their path below the folder
+    without a suffix, ``deep/room``, or ``room_ply`` beside ``room_spz``; and the newest trained run of each experiment,
+    by the experiment's name. Results of earlier commands are passed over: files of the names that these give by
+    default, and whole folders. Raises SceneError if there is no such folder, it is a run, or there is no scene."""
     folder = Path(folder)
     if not is_folder_of_scenes(folder):
         raise SceneError(f"{folder}: expected a folder with scenes below it")
     files = _files_with_gaussians(folder, is_scene_file)
     stems = {_stem(path) for path in files}
     for path in tuple(files):
-        sources = {_stem(path).removesuffix(end) for end in RESULT_ENDS} - {_stem(path)}
-        if sources & stems:
-            logger.warning("passed over %s: a result of %s", path, *sources)
+        source = re.sub("_(pruned|compact|web|phone|headset|email)$", "", _stem(path))
+        if source != _stem(path) and source in stems:
+            logger.warning("passed over %s: a result of %s", path, source)
             files.remove(path)
     named = [(_stem(path.relative_to(folder)), path) for path in files]
     with suppress(SceneError):  # no run; those passed over have been named
-        named += [(_name_below(folder, run), run.folder) for run in find_runs(folder)]
+        named += [(scene_name(run), run.folder) for run in find_runs(folder)]
     if not named:
         raise SceneError(f"{folder}: no scene below it; expected files ({READABLE}) or trained Splatfacto runs")
-    shared = {name for name, count in Counter(name for name, _ in named).items() if count > 1}
-    named = [(name + _format_end(path) if name in shared else name, path) for name, path in named]
+    counts = Counter(name for name, _ in named)
+    for index, (name, path) in enumerate(named):
+        if counts[name] > 1 and path.is_file():
+            named[index] = name + path.as_posix()[len(_stem(path)) :].replace(".", "_").lower(), path
     named.sort(key=lambda pair: (pair[0], str(pair[1])))
     return dict(zip(distinct(name for name, _ in named), (path for _, path in named), strict=True))
 
@@ -86,8 +84,12 @@ def find_runs_and_plys(
     except SceneError as error:
         why_no_run = error
     named = dict(zip(distinct(map(scene_name, runs)), runs, strict=True))
-    plys = find_plys(folder) if supervision == "dense" or (supervision == "auto" and not runs) else []
-    return named, {f"{name}.ply" if name in named else name: path for name, path in plys}, why_no_run
+    plys: list[Path] = []
+    if supervision == "dense" or (supervision == "auto" and not runs):
+        plys = _files_with_gaussians(folder, lambda name: name.lower().endswith(".ply"))
+    root = folder.parent if folder.is_file() else folder
+    names = distinct(file_stem("-".join(path.relative_to(root).with_suffix("").parts)) for path in plys)
+    return named, {f"{n}.ply" if n in named else n: path for n, path in zip(names, plys, strict=True)}, why_no_run
 
 
 def find_runs(folder: Path | str) -> list[Run]:
@@ -106,7 +108,11 @@ def find_runs(folder: Path | str) -> list[Run]:
         return [run]
     newest: dict[Path, Run] = {}
     passed: list[str] = []
-    for place in _run_folders(folder):
+    for place, inner, files in os.walk(folder):
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        if RUN_FILES.config not in files:
+            continue
+        inner.clear()  # folders in that of a run are not searched
         try:
             run = open_run(place, need_data=False)
         except SceneError as error:
@@ -125,14 +131,6 @@ def find_runs(folder: Path | str) -> list[Run]:
             f"{folder}: no trained Splatfacto run below it; expected EXPERIMENT/METHOD/TIME/{RUN_FILES.config}{seen}"
         )
     return sorted(newest.values(), key=lambda run: (scene_name(run), str(run.folder)))
-
-
-def find_plys(folder: Path) -> list[tuple[str, Path]]:
-    """Name and path of every 3DGS PLY at or below ``folder``, sorted by path."""
-    plys = _files_with_gaussians(folder, lambda name: name.lower().endswith(".ply"))
-    root = folder.parent if folder.is_file() else folder
-    names = [file_stem("-".join(path.relative_to(root).with_suffix("").parts)) for path in plys]
-    return list(zip(distinct(names), plys, strict=True))
 
 
 def distinct(names: Iterable[str]) -> list[str]:
@@ -169,9 +167,7 @@ def _files_with_gaussians(root: Path, wanted: Callable[[str], bool]) -> list[Pat
         paths += [Path(place) / name for name in files if wanted(name) and not name.startswith(".")]
     scenes = []
     for path in sorted(paths):
-        why = "" if path.is_file() else "not a regular file"
-        why = why or _why_none(path)
-        if why:
+        if why := _why_none(path):
             logger.warning("passed over %s: %s", path, why)
         else:
             scenes.append(path)
@@ -182,31 +178,6 @@ def _stem(path: Path) -> str:
     """The path of a scene's file without the suffix of its format, such as ``.compressed.ply``."""
     kind = format_named(path.name)
     return path.as_posix()[: -len(path.suffix if kind is None else kind.suffix)]
-
-
-def _format_end(path: Path) -> str:
-    """The format of a file as the end of a scene's name, such as ``_ply``; nothing for a run."""
-    return "" if path.is_dir() else path.as_posix()[len(_stem(path)) :].replace(".", "_").lower()
-
-
-def _name_below(folder: Path, run: Run) -> str:
-    """The path from a folder to a run's experiment; the scene's name if that does not lie below the folder."""
-    try:
-        name = _experiment_folder(run).relative_to(folder.resolve()).as_posix()
-    except ValueError:
-        return scene_name(run)
-    return scene_name(run) if name == "." else name
-
-
-def _run_folders(folder: Path) -> list[Path]:
-    """Folders below ``folder`` that hold a ``config.yml``, sorted; folders inside these are not searched."""
-    folders = []
-    for place, inner, files in os.walk(folder):
-        if RUN_FILES.config in files:
-            folders.append(Path(place))
-            inner.clear()
-        inner[:] = sorted(name for name in inner if not name.startswith("."))
-    return folders
 
 
 def _experiment_folder(run: Run) -> Path:
@@ -227,18 +198,16 @@ def _when(run: Run) -> tuple[float, int]:
 
 def _why_none(path: Path) -> str:
     """Why a file holds no Gaussians: it is a PLY of points or of a mesh. Empty if it does, or if its reader says it."""
+    if not path.is_file():
+        return "not a regular file"
     try:
         kind = format_to_read(path)
+        if kind is None or kind.read is not read_ply:
+            return ""
     except SceneError:
         return ""
-    if kind is None or kind.read is not read_ply:
-        return ""
-    try:
-        with path.open("rb") as stream:
-            header = read_header(stream, path)
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
-    except SceneError:
-        return "no Gaussians in it"
-    names = ({name for name, _ in element.properties} for element in header.elements)
-    return "" if any({"opacity", "scale_0", "rot_0"} <= own for own in names) else "no Gaussians in it"
+    with suppress(SceneError, OSError), path.open("rb") as stream:
+        for element in read_header(stream, path).elements:
+            if {"opacity", "scale_0", "rot_0"} <= {name for name, _ in element.properties}:
+                return ""
+    return "no Gaussians in it"

@@ -1,4 +1,4 @@
-"""Helpers of all readers and writers: checks, hashes, atomic writes."""
+"""Helpers of all readers and writers: checks of files and of places for files, hashes, atomic writes."""
 
 from __future__ import annotations
 
@@ -54,6 +54,15 @@ def read_text(path: Path, most: int = 1 << 26) -> str:
     return path.read_text("utf-8")
 
 
+@contextmanager
+def failure_named(path: Path, what: str) -> Iterator[None]:
+    """Turn an OSError into a SceneError: ``path`` cannot be ``what``, such as "read", and why."""
+    try:
+        yield
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be {what} ({error.strerror or one_line(error)})") from error
+
+
 def require_memory(path: Path | str, size: int) -> None:
     """Raise a SceneError if ``size`` bytes, which a file's content takes, are not free. A sparse file, whose zeros take
     no disk space, may claim any size."""
@@ -74,12 +83,9 @@ def content_hash(path: Path | str) -> str:
     """
     path = require_file(path, "a scene to read")
     digest = hashlib.sha256()
-    try:
-        with path.open("rb") as stream:
-            while piece := stream.read(1 << 20):
-                digest.update(piece)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
+    with failure_named(path, "read"), path.open("rb") as stream:
+        while piece := stream.read(1 << 20):
+            digest.update(piece)
     return digest.hexdigest()
 
 
@@ -117,30 +123,65 @@ def replacing(path: Path | str, size: int = 0, folder: Path | None = None, named
     path = Path(path)
     part: Path | None = None
     try:
-        foreign = not named and path.is_symlink()
-        target = path if foreign else target_of(path)
-        mode = None if foreign else _mode_of(target)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        require_space(path, target.parent, size)
-        # No other process or thread has this name, on no machine; file systems allow 255 bytes.
-        start = target.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
-        part = (folder or target.parent) / f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
-        if mode is not None:
-            part.touch(0o600)  # nobody else reads it before it is complete
-        yield part
-        if mode is not None:
-            part.chmod(mode)
-        os.replace(part, target)
-    except OSError as error:
-        why = error.strerror or one_line(error)
-        raise SceneError(f"{path}: cannot be written ({why})") from error
+        with failure_named(path, "written"):
+            foreign = not named and path.is_symlink()
+            target = path if foreign else _target_of(path)
+            mode = None if foreign else _mode_of(target)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            require_space(path, target.parent, size)
+            # No other process or thread has this name, on no machine; file systems allow 255 bytes.
+            start = target.name.encode("utf-8", "surrogateescape")[:200].decode("utf-8", "ignore")
+            part = (folder or target.parent) / f".{start}.{os.getpid()}-{secrets.token_hex(4)}.part"
+            if mode is not None:
+                part.touch(0o600)  # nobody else reads it before it is complete
+            yield part
+            if mode is not None:
+                part.chmod(mode)
+            os.replace(part, target)
     finally:
         if part is not None:
             with suppress(OSError):  # it may never have been there; the error above says why
                 part.unlink()
 
 
-def target_of(path: Path) -> Path:
+def need_suffix(path: Path, suffix: str) -> None:
+    """Raise a SceneError if a path does not end in a suffix, such as ``.png``."""
+    if path.suffix.lower() != suffix:
+        what = f"a {path.suffix or 'nameless'} file"
+        raise SceneError(f"{path}: cannot write {what}; expected a name that ends in {suffix}")
+
+
+def need_new(path: Path, force: bool) -> None:
+    """Raise a SceneError if a path exists and may not be replaced."""
+    if _target_of(path).exists() and not force:
+        raise SceneError(f"{path}: exists already; name another file, or overwrite it with --force")
+
+
+def need_writable(path: Path, force: bool) -> None:
+    """Raise a SceneError if a file cannot be written: it is a folder, a pipe or a device, its folder takes none, or it
+    exists and ``force`` does not allow to replace it."""
+    with failure_named(path, "written"):
+        need_new(path, force)
+        _need_place(path, _target_of(path).absolute().parent)
+
+
+def need_folder(path: Path) -> None:
+    """Raise a SceneError if nothing can be written to a folder, which may be missing."""
+    if os.path.lexists(path) and not path.is_dir():
+        raise SceneError(f"{path}: is a file; expected the name of a folder")
+    with failure_named(path, "written"):
+        _need_place(path, path.absolute())
+
+
+def _need_place(path: Path, folder: Path) -> None:
+    """Raise a SceneError, about ``path``, if a folder cannot be written to, or cannot be made."""
+    above = next(place for place in (folder, *folder.parents) if place.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        why = "is no folder" if not above.is_dir() else "takes no files"
+        raise SceneError(f"{path}: cannot be written ({above} {why})")
+
+
+def _target_of(path: Path) -> Path:
     """The file that is written for ``path``: the target of a symbolic link, else ``path`` itself.
 
     Raises:

@@ -100,13 +100,9 @@ def _count(node: yaml.Node, known: dict[int, int], most: int = 1 << 16) -> int:
 def _python(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
     """The inert value of a tag ``!!python/<suffix>``."""
     kind, _, name = suffix.partition(":")
-    if kind in ("str", "unicode") and isinstance(node, yaml.ScalarNode):
-        return node.value
     value = _plain(loader, node)
     if kind == "tuple" and isinstance(value, list):
         return tuple(value)
-    if kind in ("list", "dict", "none", "bool", "int", "long", "float") and not name:
-        return value
     of_text = isinstance(value, list) and all(isinstance(part, str) for part in value)
     if kind.startswith("object/") and name.startswith("pathlib") and of_text:
         parts = [PureWindowsPath(part).as_posix() for part in value] if "Windows" in name else value

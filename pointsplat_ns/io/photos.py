@@ -23,9 +23,6 @@ from pointsplat_ns.system.tensors import DOUBLES
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
-MOST_FILES = 100_000
-"""Largest number of photos that are looked for."""
-
 MOST_PIXELS = 150_000_000
 """Largest photo that is decoded: 450 MB as bytes of RGB."""
 
@@ -41,8 +38,8 @@ def photo_files(folder: Path) -> list[str]:
         relative = Path(place).relative_to(folder)
         shown = (name for name in files if not name.startswith("."))
         found += [(relative / name).as_posix() for name in shown if name.lower().endswith(PHOTO_SUFFIXES)]
-        if len(found) > MOST_FILES:
-            raise DataError(f"{folder}: more than {MOST_FILES:,} photos; expected the folder of one capture's photos")
+        if len(found) > 100_000:
+            raise DataError(f"{folder}: more than 100,000 photos; expected the folder of one capture's photos")
     if not found:
         raise DataError(f"{folder}: no photo in it; expected files {', '.join(PHOTO_SUFFIXES)}")
     return sorted(found)

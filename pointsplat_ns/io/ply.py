@@ -7,39 +7,46 @@ coefficients of red, then green, then blue. Normals are not used; they are writt
 
 from __future__ import annotations
 
+import functools
 import io
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians, Offset, Traits, sh_degree_of
-from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
+from pointsplat_ns.gaussians import MAX_SH_DEGREE, PLAIN, Gaussians, Offset, Traits, sh_degree_of
+from pointsplat_ns.io.files import failure_named, logger, one_line, replacing, require_file, require_memory
 from pointsplat_ns.io.offsets import SAMPLED, offset_for, offset_text
-from pointsplat_ns.io.ply_dialects import COLUMNS, FILTER, attributes_of, columns_of, is_flat
-from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
-from pointsplat_ns.io.ply_writing import column_names
+from pointsplat_ns.io.ply_header import Element, Header, first_lines, read_header, traits_of
+from pointsplat_ns.io.usable import keep_usable
+from pointsplat_ns.system.pieces import CHUNK
 
-MAX_REST = (MAX_SH_DEGREE + 1) ** 2 - 1
-"""Number of SH coefficients per channel beyond the constant one that are read."""
+COLUMNS = {
+    "means": ["x", "y", "z"],
+    "normals": ["nx", "ny", "nz"],
+    "features_dc": ["f_dc_0", "f_dc_1", "f_dc_2"],
+    "opacities": ["opacity"],
+    "scales": ["scale_0", "scale_1", "scale_2"],
+    "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+}
+"""Vertex properties of the attributes; normals are written as zeros and not read."""
 
 
 def read_ply(path: Path | str) -> Gaussians:
     """Read a 3DGS PLY: binary of either byte order, or ASCII; properties in any order and of any type.
 
     The SH degree follows from the number of ``f_rest`` properties; of degree 4, the bands up to 3 are read. 2D
-    Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of names, and Mip-Splatting's
-    3D filter are understood (:mod:`~pointsplat_ns.io.ply_dialects`). Other properties and elements, and bytes after the
-    last element, are not read; a warning says so.
+    Gaussians, which have no ``scale_2``, become flat ones. CloudCompare's prefixes of names are understood. Other
+    properties and elements are not read; a warning says so.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
     """
-    rows = PlyRows(path, whole=True)
+    rows = PlyRows(path)
+    require_memory(path, rows.count * 4 * (14 + 3 * rows.rest))  # float32 numbers
     return rows.read(0, len(rows))
 
 
@@ -49,7 +56,6 @@ class PlyRows:
     Args:
         path: the file.
         warn: whether what is not read, and the offset of positions, are logged.
-        whole: whether all rows will be read at once.
 
     Raises:
         SceneError: if the file is not a PLY, is truncated, or lacks a property.
@@ -63,23 +69,19 @@ class PlyRows:
     traits: Traits
     """What the file declares beside the Gaussians."""
 
-    def __init__(self, path: Path | str, warn: bool = True, whole: bool = False):
+    def __init__(self, path: Path | str, warn: bool = True):
         self.path = path = require_file(path, "a 3DGS PLY file")
-        with _opened(path) as stream:
-            header = read_header(stream, path)
-        vertex = _gaussian_element(header, path)
+        with failure_named(path, "read"), path.open("rb") as stream:
+            self._header = header = read_header(stream, path)
+        self._vertex = vertex = _gaussian_element(header, path)
         self.count, self._in_file = vertex.count, _num_rest(vertex, path)
-        self.rest = min(self._in_file, MAX_REST)
-        if whole:
-            require_memory(path, vertex.count * 4 * (14 + 3 * self.rest))  # float32 numbers
+        self.rest = min(self._in_file, (MAX_SH_DEGREE + 1) ** 2 - 1)
         if warn:
-            _report_unread(header, vertex, self._in_file, path)
+            _report_unread(header, vertex, self._in_file > self.rest, path)
         self._dtype = np.dtype([(name, header.order + np.dtype(kind).str[1:]) for name, kind in vertex.properties])
-        self._names = self._dtype.names or ()
+        self._scales = [name for name in COLUMNS["scales"] if name in (self._dtype.names or ())]
         self._start = header.size + sum(_least_bytes(element, header) for element in header.before("vertex"))
-        self._parsed = None if header.order else _parsed(path, header, vertex)
-        traits = traits_of(header, path)  # who trained with Mip-Splatting's 3D filter trained with antialiasing
-        self.traits = traits._replace(antialiased=traits.antialiased or FILTER in self._names)
+        self.traits = traits_of(header, path)
         self._shift: Offset | None = None
         if vertex.count and any(self._dtype[name].newbyteorder("=") == np.float64 for name in "xyz"):
             self._shift_positions(warn)
@@ -87,9 +89,8 @@ class PlyRows:
     @classmethod
     def open(cls, path: Path | str, warn: bool = True) -> PlyRows | None:
         """The rows of a file, which may ``warn``; None for an ASCII file, which has no rows of one length."""
-        path = require_file(path, "a 3DGS PLY file")
-        with _opened(path) as stream:
-            return cls(path, warn) if read_header(stream, path).order else None
+        rows = cls(path, warn)
+        return rows if rows._header.order else None
 
     def __len__(self) -> int:
         return self.count
@@ -102,33 +103,68 @@ class PlyRows:
     def read(self, start: int, stop: int) -> Gaussians:
         """The Gaussians of rows ``start`` to ``stop`` - 1, float32, those that cannot be drawn included. Raises
         SceneError if the file cannot be read or has become shorter."""
-        with _opened(self.path) as stream:
-            return self._scene(stop - start, lambda these: self._rows(stream, [range(start, stop)[these]]))
+        return self.pick(range(start, stop))
 
     def pick(self, rows: Sequence[int]) -> Gaussians:
         """The Gaussians of single rows, as :meth:`read` gives them."""
-        with _opened(self.path) as stream:
-            return self._scene(len(rows), lambda these: self._rows(stream, [range(n, n + 1) for n in rows[these]]))
+        from numpy.lib.recfunctions import structured_to_unstructured
 
-    def _rows(self, stream: io.BufferedReader, ranges: Sequence[range]) -> np.ndarray:
-        """Rows in ranges, one after the other. Raises SceneError if the file has become shorter."""
-        if self._parsed is not None:
-            return np.concatenate([self._parsed[part.start : part.stop] for part in ranges])
+        # Channel-major in the file, channel last in a scene.
+        rest = [f"f_rest_{channel * self._in_file + i}" for i in range(self.rest) for channel in range(3)]
+        columns = {name: COLUMNS[name] for name in ("means", "scales", "quats", "opacities", "features_dc")}
+        columns["features_rest"] = rest
+        tables = {name: np.full((len(rows), len(fields)), -np.inf, np.float32) for name, fields in columns.items()}
+        columns["scales"] = self._scales  # of 2D Gaussians the last stays -Inf: a flat axis
+        at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
+        # A double beyond float32 becomes Inf and is dropped with the others.
+        with np.errstate(over="ignore"), failure_named(self.path, "read"), self.path.open("rb") as stream:
+            for start in range(0, len(rows), at_once):
+                chunk = slice(start, min(start + at_once, len(rows)))
+                values = self._rows(stream, rows[chunk])
+                if self._shift is not None:
+                    tables["means"][chunk] = _doubles(values, COLUMNS["means"]) - self._shift
+                for name, fields in columns.items():
+                    if fields and not (name == "means" and self._shift is not None):
+                        tables[name][chunk, : len(fields)] = structured_to_unstructured(values[fields], np.float32)
+        tensors = {name: torch.from_numpy(table) for name, table in tables.items()}
+        tensors["features_rest"] = tensors["features_rest"].reshape(len(rows), self.rest, 3)
+        antialiased, up, offset = self.traits
+        return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
+
+    def _rows(self, stream: io.BufferedReader, numbers: Sequence[int]) -> np.ndarray:
+        """Rows of these numbers. Raises SceneError if the file has become shorter."""
+        together = isinstance(numbers, range) and numbers.step == 1
+        parts = [(numbers[0], len(numbers))] if together else [(number, 1) for number in numbers]
+        if not self._header.order:
+            return np.concatenate([self._parsed[first : first + count] for first, count in parts])
         size, pieces = self._dtype.itemsize, []
-        for part in ranges:
-            stream.seek(self._start + part.start * size)
-            pieces.append(stream.read(len(part) * size))
-        if sum(map(len, pieces)) < size * sum(map(len, ranges)):
+        for first, count in parts:
+            stream.seek(self._start + first * size)
+            pieces.append(stream.read(count * size))
+        if sum(map(len, pieces)) < size * len(numbers):
             raise SceneError(f"{self.path}: truncated while it was read; expected {self.count} Gaussians")
         return np.frombuffer(b"".join(pieces), self._dtype)
 
+    @functools.cached_property
+    def _parsed(self) -> np.ndarray:
+        """The rows of an ASCII file. plyfile gets a checked header that ends with the Gaussians, so comments in other
+        encodings and elements after the Gaussians cannot cause errors. Raises SceneError if they are damaged."""
+        from plyfile import PlyData, PlyParseError
+
+        require_memory(self.path, 2 * self.path.stat().st_size)
+        with failure_named(self.path, "read"):
+            text = self._header.up_to("vertex") + self.path.read_bytes()[self._header.size :]
+        try:
+            return PlyData.read(io.BytesIO(text))["vertex"].data
+        except (PlyParseError, ValueError, OverflowError) as error:
+            wanted = f"{self.count} Gaussians of {len(self._vertex.properties)} numbers"
+            raise SceneError(f"{self.path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
+
     def _shift_positions(self, warn: bool) -> None:
         """Subtract an offset from positions that float32 would round too far, which is logged if ``warn``."""
-        with _opened(self.path) as stream:
-            some = range(0, self.count, max(1, self.count // SAMPLED))
-            rows = self._rows(stream, [range(number, number + 1) for number in some])
-        scales = [name for name in COLUMNS["scales"] if name in self._names]
-        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, scales))
+        with failure_named(self.path, "read"), self.path.open("rb") as stream:
+            rows = self._rows(stream, [*range(0, self.count, max(1, self.count // SAMPLED))])
+        self._shift = offset_for(_doubles(rows, COLUMNS["means"]), _doubles(rows, self._scales))
         if self._shift is not None:
             x, y, z = (a + b for a, b in zip(self.traits.offset or (0.0, 0.0, 0.0), self._shift, strict=True))
             self.traits = self.traits._replace(offset=(x, y, z))
@@ -136,69 +172,9 @@ class PlyRows:
                 text = offset_text((x, y, z))
                 logger.info("%s: positions are doubles; their offset %s is kept beside the scene", self.path, text)
 
-    def _scene(self, count: int, rows_of: Callable[[slice], np.ndarray]) -> Gaussians:
-        """The Gaussians in ``count`` rows, of which ``rows_of`` gives those of a slice."""
-        from numpy.lib.recfunctions import structured_to_unstructured
-
-        # Channel-major in the file, channel last in a scene.
-        rest = [f"f_rest_{channel * self._in_file + i}" for i in range(self.rest) for channel in range(3)]
-        columns = columns_of(self._names) | {"features_rest": rest}
-        tables = {name: np.empty((count, len(fields)), np.float32) for name, fields in columns.items()}
-        at_once = 16_384  # rows, about 4 MB: they fit into the processor's cache
-        # A double beyond float32 becomes Inf and is dropped with the others.
-        with np.errstate(over="ignore"):
-            for start in range(0, count, at_once):
-                chunk = slice(start, min(start + at_once, count))
-                rows = rows_of(chunk)
-                if self._shift is not None:
-                    tables["means"][chunk] = _doubles(rows, COLUMNS["means"]) - self._shift
-                for name, fields in columns.items():
-                    if fields and not (name == "means" and self._shift is not None):
-                        tables[name][chunk] = structured_to_unstructured(rows[fields], np.float32)
-        tensors = {name: torch.from_numpy(table) for name, table in attributes_of(tables, self._names).items()}
-        tensors["features_rest"] = tensors["features_rest"].reshape(count, self.rest, 3)
-        antialiased, up, offset = self.traits
-        return Gaussians(**tensors, antialiased=antialiased, up=up, offset=offset)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[io.BufferedReader]:
-    """The file, open. Raises SceneError if it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            yield stream
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from error
-
 
 def _doubles(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
-
-
-def _parsed(path: Path, header: Header, vertex: Element) -> np.ndarray:
-    """The rows of an ASCII file. plyfile gets a checked header that ends with the Gaussians, so comments in other
-    encodings and elements after the Gaussians cannot cause errors. Raises SceneError if they are damaged."""
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        with _GaussiansAlone(path, header) as stream:
-            return PlyData.read(stream)["vertex"].data
-    except (PlyParseError, ValueError, OverflowError) as error:
-        wanted = f"{vertex.count} Gaussians of {len(vertex.properties)} numbers"
-        raise SceneError(f"{path}: damaged PLY ({one_line(error)}); expected {wanted}") from error
-
-
-class _GaussiansAlone(io.FileIO):
-    """A PLY file whose header is another."""
-
-    def __init__(self, path: Path, header: Header):
-        super().__init__(path)
-        self.seek(header.size)
-        self._header = io.BytesIO(header.up_to("vertex"))
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Bytes of the header until it ends, then of the file."""
-        return self._header.read(size) or super().read(-1 if size is None else size)
 
 
 def _gaussian_element(header: Header, path: Path) -> Element:
@@ -224,20 +200,14 @@ def _gaussian_element(header: Header, path: Path) -> Element:
     return vertex
 
 
-def _report_unread(header: Header, vertex: Element, in_file: int, path: Path) -> None:
+def _report_unread(header: Header, vertex: Element, higher: bool, path: Path) -> None:
     """Warn of what a file holds beside the Gaussians that are read."""
-    if in_file > MAX_REST:
+    if higher:
         logger.warning("%s: SH degree 4, read up to degree %d", path, MAX_SH_DEGREE)
-    known = {name for names in COLUMNS.values() for name in names} | {FILTER}
-    present = {name for name, _ in vertex.properties}
-    if FILTER in present:
-        logger.info("%s: Mip-Splatting's 3D filter is put into sizes and opacities", path)
+    known = {name for names in COLUMNS.values() for name in names}
     others = [name for name, _ in vertex.properties if name not in known and not name.startswith("f_rest_")]
     unread = [f"the vertex properties {', '.join(others[:4])}{'...' if len(others) > 4 else ''}"] if others else []
     unread += [f"the element {element.name!r}" for element in header.elements if element != vertex and element.count]
-    if header.order and not any(element.lists for element in header.elements):
-        after = path.stat().st_size - header.size - sum(_least_bytes(element, header) for element in header.elements)
-        unread += [f"{after} bytes after the last element"] if after > 0 else []
     if unread:
         logger.warning("%s: not read: %s", path, "; ".join(unread[:4]))
 
@@ -255,7 +225,12 @@ def _num_rest(vertex: Element, path: Path) -> int:
     present = {name for name, _ in vertex.properties}
     if "packed_position" in present:
         raise SceneError(f"{path}: a compressed PLY (property 'packed_position'); expected a plain one")
-    if is_flat(present):
+    if "filter_3D" in present:
+        raise SceneError(
+            f"{path}: Mip-Splatting's 3D filter lies beside the sizes (property 'filter_3D'); expected both fused, as "
+            "its create_fused_ply.py writes them"
+        )
+    if "scale_2" not in present and {"scale_0", "scale_1", "opacity"} <= present:
         logger.warning("%s: 2D Gaussians (no 'scale_2'), read as flat 3D ones", path)
         present.add("scale_2")
     rest = sorted(int(name[7:]) for name in present if re.fullmatch(r"f_rest_(0|[1-9]\d{0,5})", name))
@@ -271,3 +246,48 @@ def _num_rest(vertex: Element, path: Path) -> int:
             "(SH degree 0 to 4)"
         )
     return len(rest) // 3
+
+
+def write_ply(scene: Gaussians, path: Path | str) -> None:
+    """Write ``scene`` as a 3DGS PLY: binary little endian, float32, the reference's property order.
+
+    :func:`read_ply` reads a float32 scene back unchanged to the bit. Gaussians that cannot be drawn (NaN, or Inf
+    where it is not valid) are left out, and their number is logged. The write is atomic.
+
+    Raises:
+        SceneError: if ``path`` cannot be written.
+    """
+    scene = keep_usable(scene.detach().to("cpu", torch.float32), path)
+    about = len(scene), scene.sh_degree, scene.traits
+    with replacing(path, ply_bytes(*about)) as part, part.open("wb") as stream:
+        stream.write(header_bytes(*about))
+        for first in range(0, len(scene), CHUNK):
+            stream.write(row_table(scene[first : first + CHUNK]).data)
+
+
+def row_table(scene: Gaussians) -> np.ndarray:
+    """The rows of a 3DGS PLY, (N, 17 + 3 K) little-endian float32, of a float32 scene on the CPU."""
+    rest = scene.features_rest.transpose(1, 2).reshape(len(scene), 3 * scene.features_rest.shape[1])
+    values = [scene.means, torch.zeros_like(scene.means), scene.features_dc, rest]
+    values += [scene.opacities, scene.scales, scene.quats]
+    return np.ascontiguousarray(torch.cat(values, dim=1).numpy().astype("<f4", copy=False))
+
+
+def header_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> bytes:
+    """The header of a 3DGS PLY of ``count`` Gaussians, whose :func:`row_table` follows."""
+    names = column_names(3 * ((sh_degree + 1) ** 2 - 1))
+    lines = [*first_lines(traits), f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
+
+
+def ply_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
+    """Size of the 3DGS PLY of ``count`` Gaussians, bytes: an ASCII header, then 17 numbers a Gaussian (normals
+    included) and three for each SH coefficient beyond the constant one, as float32."""
+    return len(header_bytes(count, sh_degree, traits)) + 4 * (17 + 3 * ((sh_degree + 1) ** 2 - 1)) * count
+
+
+def column_names(rest: int) -> list[str]:
+    """All vertex properties in the order of files, with so many of SH beyond the constant one."""
+    first = [*COLUMNS["means"], *COLUMNS["normals"], *COLUMNS["features_dc"]]
+    last = [*COLUMNS["opacities"], *COLUMNS["scales"], *COLUMNS["quats"]]
+    return [*first, *(f"f_rest_{i}" for i in range(rest)), *last]

@@ -1,7 +1,7 @@
 """Parses the header of a PLY file, of limited length.
 
 It is parsed before anything is allocated for the data, so that a damaged or hostile header (a count of 10^15, a header
-without an end) does no harm. :mod:`~pointsplat_ns.io.ply` checks its counts against the size of the file.
+without an end) does no harm. Readers check its counts against the size of the file.
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ _TYPES = {
     "float": "float32", "float32": "float32", "double": "float64", "float64": "float64",
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-OFFSET = "Offset: "
-"""The start of the comment with the offset of positions: three numbers that are added to x, y and z."""
 
 
 @dataclass(frozen=True)
@@ -88,27 +85,20 @@ def read_header(stream: BinaryIO, path: Path) -> Header:
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments = tuple(line.partition(" ")[2].strip() for line in text[1:] if line.startswith("comment "))
     for number, line in enumerate(text[1:], start=2):
-        words = line.split()
-        keyword = words[0] if words else ""
-        if keyword in ("", "comment", "obj_info"):
-            continue
-        if keyword == "format" and len(words) == 3 and words[1] in _ORDERS and words[2] == "1.0":
-            order = _ORDERS[words[1]]
-        elif keyword == "element" and len(words) == 3 and words[2].isascii() and words[2].isdigit():
-            # A number of over 18 digits exceeds every file; cut short, it still does.
-            elements.append((words[1], int(words[2][:19]), []))
-        elif keyword == "property" and elements and len(words) == 3 and words[1] in _TYPES:
-            elements[-1][2].append((words[2], _TYPES[words[1]]))
-        elif (
-            keyword == "property"
-            and elements
-            and len(words) == 5
-            and words[1] == "list"
-            and {*words[2:4]} <= _TYPES.keys()
-        ):
-            elements[-1][2].append((words[4], f"list {_TYPES[words[2]]} {_TYPES[words[3]]}"))
-        else:
-            raise SceneError(f"{path}: PLY header line {number} is not understood: {line[:80]!r}")
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", form, "1.0"] if form in _ORDERS:
+                order = _ORDERS[form]
+            case ["element", name, count] if count.isascii() and count.isdigit():
+                # A number of over 18 digits exceeds every file; cut short, it still does.
+                elements.append((name, int(count[:19]), []))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1][2].append((name, _TYPES[kind]))
+            case ["property", "list", count, kind, name] if elements and {count, kind} <= _TYPES.keys():
+                elements[-1][2].append((name, f"list {_TYPES[count]} {_TYPES[kind]}"))
+            case _:
+                raise SceneError(f"{path}: PLY header line {number} is not understood: {line[:80]!r}")
     if order is None:
         raise SceneError(f"{path}: PLY header names no format; expected ascii, binary_little_endian or _big_endian")
     _reject_duplicates([name for name, _, _ in elements], "element", path)
@@ -128,7 +118,7 @@ def first_lines(traits: Traits) -> list[str]:
     """The lines of a header before its elements. Comments are those that :func:`traits_of` reads."""
     comments = ["SplatRenderMode: mip"] * traits.antialiased
     comments += [] if traits.up is None else [f"Vertical Axis: {traits.up}"]
-    comments += [] if traits.offset is None else [OFFSET + offset_text(traits.offset)]
+    comments += [] if traits.offset is None else [f"Offset: {offset_text(traits.offset)}"]
     return ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
 
 
@@ -150,8 +140,8 @@ def traits_of(header: Header, path: Path) -> Traits:
             found = words[1] == "1"
         elif words[:2] == ["vertical", "axis"] and len(words) == 3 and words[2].removeprefix("+") in AXES:
             up = words[2].removeprefix("+")
-        elif comment.startswith(OFFSET):
-            offset = offset_of_text(comment.removeprefix(OFFSET))
+        elif comment.startswith("Offset: "):  # three numbers that are added to x, y and z
+            offset = offset_of_text(comment.removeprefix("Offset: "))
             if offset is None:
                 logger.warning("%s: no offset of three numbers in the comment %r", path, comment[:80])
     return Traits(found, up, offset)

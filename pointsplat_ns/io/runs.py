@@ -34,10 +34,6 @@ class RunFiles:
     """The transform of the dataset from the frame of its poses to that of the scene."""
     refiner: str = "refiner.safetensors"
     """Weights of the refiner that the run trained."""
-    configs: tuple[str, ...] = (".yml", ".yaml")
-    """Ends of the names of configurations."""
-    suffixes: tuple[str, ...] = (".ckpt", *configs)
-    """Ends of the names of files that stand for a run."""
 
 
 RUN_FILES = RunFiles()
@@ -66,8 +62,6 @@ class Run:
     checkpoint: Path
     """The newest complete checkpoint, or the one that was asked for."""
     step: int
-    planned_steps: int | None
-    """Steps that the training was to take in all, as configured; None if ``config.yml`` gives no number."""
     method_name: str
     experiment_name: str
     """As configured; empty or "unnamed" where the user gave none."""
@@ -79,8 +73,6 @@ class Run:
     """Dotted name of the dataparser's configuration class."""
     dataparser_fields: dict[str, Any]
     datamanager_fields: dict[str, Any]
-    model_class: str
-    """Dotted name of the model's configuration class."""
     model_fields: dict[str, Any]
     transform: Tensor  # [3, 4] float32, data world to scene, before the scale
     scale: float
@@ -109,7 +101,7 @@ class Run:
 def may_be_run(path: Path | str) -> bool:
     """Whether a path is one that runs have: a folder, a checkpoint or YAML. Other files hold nothing but a scene."""
     path = Path(path)
-    return path.is_dir() or path.suffix.lower() in RUN_FILES.suffixes
+    return path.is_dir() or path.suffix.lower() in (".ckpt", ".yml", ".yaml")
 
 
 def open_run(path: Path | str, need_data: bool = True, data: Path | str | None = None) -> Run:
@@ -147,17 +139,13 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
     checkpoint, step = _checkpoint(folder, root.fields.get("relative_model_dir"), chosen)
     candidates = (datamanager.fields.get("data"), dataparser.fields.get("data"), root.fields.get("data"))
     named = next((Path(value) for value in candidates if isinstance(value, (str, Path)) and str(value) != "."), Path())
-    found = named
-    if need_data:
-        found = _find_data(named, folder, config_path) if data is None else _moved_data(named, Path(data), config_path)
+    found = _found_data(named, folder, config_path, data) if need_data else named
     transform, scale = read_transforms(folder / RUN_FILES.transforms)
-    planned = root.fields.get("max_num_iterations")
     return Run(
         folder=folder,
         config_path=config_path,
         checkpoint=checkpoint,
         step=step,
-        planned_steps=planned if isinstance(planned, int) else None,
         method_name=str(root.fields.get("method_name") or ""),
         experiment_name=str(root.fields.get("experiment_name") or ""),
         timestamp=str(root.fields.get("timestamp") or ""),
@@ -165,7 +153,6 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
         dataparser_class=dataparser.tag,
         dataparser_fields=_settings(dataparser, "data"),
         datamanager_fields=_settings(datamanager, "data", "dataparser"),
-        model_class=model.tag,
         model_fields=_settings(model),
         transform=transform,
         scale=scale,
@@ -174,19 +161,15 @@ def open_run(path: Path | str, need_data: bool = True, data: Path | str | None =
 
 def scene_name(run: Run) -> str:
     """A short name for the scene that can be a file name: the experiment's, or the data folder's if it has none."""
-    name = run.experiment_name if run.experiment_name not in ("", "unnamed") else ""
+    name = run.experiment_name if run.experiment_name != "unnamed" else ""
     data = run.data.parent if run.data.suffix else run.data
-    name = name or data.name or run.folder.name
-    return file_stem(name)
+    return file_stem(name or data.name or run.folder.name)
 
 
 def name_of(path: Path) -> str:
     """The name of a scene that can be a file name: that of its run, or else of its file."""
-    if may_be_run(path):
-        try:
-            return scene_name(open_run(path, need_data=False))
-        except SceneError:
-            pass  # a checkpoint outside a run
+    with suppress(SceneError):  # no run
+        return scene_name(open_run(path, need_data=False))
     return file_stem(path.stem)
 
 
@@ -212,13 +195,10 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
     """The checkpoint to use and its step."""
     if chosen is not None:
         return chosen, step_of(chosen) or 0
-    inside = folder / configured if isinstance(configured, Path) and not configured.is_absolute() else None
-    place = inside if inside is not None and inside.is_dir() else folder / "nerfstudio_models"
-    steps = {}
-    for file in place.glob("step-*.ckpt"):
-        step = step_of(file)
-        if step is not None:
-            steps[step] = file
+    place = folder / "nerfstudio_models"
+    if isinstance(configured, Path) and not configured.is_absolute() and (folder / configured).is_dir():
+        place = folder / configured
+    steps = {step: file for file in place.glob("step-*.ckpt") if (step := step_of(file)) is not None}
     for step in sorted(steps, reverse=True):
         if is_complete(steps[step]):
             return steps[step], step
@@ -229,34 +209,30 @@ def _checkpoint(folder: Path, configured: Any, chosen: Path | None) -> tuple[Pat
     )
 
 
-def _moved_data(named: Path, place: Path, config_path: Path) -> Path:
-    """The data of a run at or below a folder: by the last names of its configured path, as many as possible."""
-    names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
-    for candidate in (*(place.joinpath(*names[first:]) for first in range(len(names))), place):
-        with suppress(OSError):  # a name that is too long, a folder that may not be looked into
-            if candidate.exists():
-                return candidate
-    raise SceneError(f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a folder above")
-
-
-def _find_data(data: Path, folder: Path, config_path: Path) -> Path:
-    """The configured data's path on this machine."""
-    if data == Path():
+def _found_data(named: Path, folder: Path, config_path: Path, place: Path | str | None) -> Path:
+    """The data of the run in a folder on this machine: its configured path, from the current folder or from the run's
+    or one above; or at or below ``place``, by as many last names of the configured path as possible."""
+    if named == Path() and place is None:
         raise SceneError(f"{config_path}: names no data folder; expected the photos that the run was trained on")
-    with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
-        data = data.expanduser()
-    if data.is_absolute():
-        tried = [data]
+    if place is not None:
+        names = [name for name in named.parts if name not in (named.anchor, "..", "~")]
+        tried = [Path(place, *names[first:]) for first in range(len(names) + 1)]
     else:
+        with suppress(RuntimeError):  # "~nobody": a user whom this machine does not know
+            named = named.expanduser()
         home = folder.resolve()
-        tried = list(dict.fromkeys([Path.cwd() / data, *(above / data for above in (home, *home.parents))]))
+        tried = list(dict.fromkeys(above / named for above in (Path.cwd(), home, *home.parents)))
     for candidate in tried:
         with suppress(OSError):  # a name that is too long, a folder that may not be looked into
             if candidate.exists():
                 return candidate
+    if place is not None:
+        raise SceneError(
+            f"{place}: no such folder; expected the data of {config_path}, once at {named}, or a folder above"
+        )
     places = ", ".join(map(str, tried[:3])) + (f" and {len(tried) - 3} more above" if len(tried) > 3 else "")
     raise SceneError(
-        f"{config_path}: its data {data} is not there; tried {places}; "
+        f"{config_path}: its data {named} is not there; tried {places}; "
         "name the folder where it is now (--data DIR), or put the data back"
     )
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import content_hash, logger, one_line, require_file
+from pointsplat_ns.io.files import content_hash, failure_named, logger, require_file
 from pointsplat_ns.io.formats import (
     READABLE,
     SOG_META,
@@ -77,41 +78,35 @@ def read_scene(path: Path | str, all_rows: bool = False) -> Gaussians:
         2
     """
     path = Path(path)
-    found = _found(path)
-    run = found if isinstance(found, Run) else _run_around(path, found)
-    if isinstance(found, Run):
-        scene = read_checkpoint(found.checkpoint)
-    else:
-        assert found.read is not None
-        scene = found.read(path)
+    read, file, _, run = _found(path)
+    scene = read(file)
     if not all_rows:
-        scene = keep_usable(scene, found.checkpoint if isinstance(found, Run) else path)
+        scene = keep_usable(scene, file)
         warn_if_far(scene, path)
     return scene if run is None else scene.replace(antialiased=run.rasterize_mode == "antialiased")
 
 
-def _found(path: Path) -> Format | Run:
-    """The format of a file or a SOG folder, or the run at a path. Raises SceneError as :func:`read_scene`."""
-    run = path.is_dir() and (path / RUN_FILES.config).is_file()
+def _found(path: Path) -> tuple[Callable[[Path], Gaussians], Path, str, Run | None]:
+    """The reader of a scene, the file to read, the name of its kind, and the run that it belongs to, if it does. Raises
+    SceneError as :func:`read_scene`."""
+    is_run = path.is_dir() and (path / RUN_FILES.config).is_file()
     if not path.is_dir():
         require_file(path, SCENE_KINDS)
-    kind = None if run else format_to_read(path)
+    kind = None if is_run else format_to_read(path)
     if kind is not None:
-        return kind
-    if run or path.suffix.lower() in RUN_FILES.configs:
-        return open_run(path, need_data=False)
+        assert kind.read is not None
+        run = None
+        if kind.read is read_checkpoint:
+            with suppress(SceneError):  # it lies outside of one
+                run = open_run(path, need_data=False)
+        return kind.read, path, kind.name, run
+    if is_run or path.suffix.lower() in (".yml", ".yaml"):
+        run = open_run(path, need_data=False)
+        return read_checkpoint, run.checkpoint, "run", run
     what = (
         f"a folder without {RUN_FILES.config} or {SOG_META}" if path.is_dir() else f"a {path.suffix or 'nameless'} file"
     )
     raise SceneError(f"{path}: {what}; expected {SCENE_KINDS}")
-
-
-def _run_around(path: Path, kind: Format) -> Run | None:
-    """The run of a checkpoint; None if it lies outside of one, or the file is of another format."""
-    if kind.read is read_checkpoint:
-        with suppress(SceneError):
-            return open_run(path, need_data=False)
-    return None
 
 
 def kind_of(path: Path | str) -> str:
@@ -124,14 +119,8 @@ def kind_of(path: Path | str) -> str:
         >>> kind_of(Path(pointsplat_ns.__file__).parent / "examples" / "room.ply")
         '3DGS PLY'
     """
-    path = Path(path)
-    found = _found(path)
-    run = found if isinstance(found, Run) else _run_around(path, found)
-    if run is not None:
-        what = "run" if found is run else "checkpoint"
-        return f"{what} of {run.method_name or 'an unknown method'}, step {run.step}"
-    assert isinstance(found, Format)
-    return found.name
+    _, _, name, run = _found(Path(path))
+    return name if run is None else f"{name} of {run.method_name or 'an unknown method'}, step {run.step}"
 
 
 def save(scene: Gaussians, path: Path | str, progress: bool | Progress = False, overwrite: bool = False) -> None:
@@ -187,54 +176,40 @@ def warn_of_losses(kind: Format, scene: Gaussians, name: Path | str) -> None:
         logger.warning("%s: lost in %s: %s; %s keeps it", name, kind.name, "; ".join(found), keeper)
 
 
-@dataclass(frozen=True)
-class SourceFile:
-    """The file that a dense scene was read from. Of a SOG folder, streamed or not, ``name`` is that of the folder,
-    ``bytes`` are those of all files, and ``sha256`` is that of the lines "path hash" of each, by its path in the
-    folder."""
+class SourceFile(NamedTuple):
+    """The file that a dense scene was read from."""
 
     name: str
+    """Of a SOG folder, streamed or not, that of the folder."""
     bytes: int
+    """Of all files of the folder."""
     sha256: str
+    """That of the lines "path hash" of the folder's files, by their paths in it."""
 
 
 def source_file(path: Path | str) -> SourceFile:
     """The file that :func:`~pointsplat_ns.io.read_scene` reads a scene from: for a run, its checkpoint. Raises
     SceneError if there is none, or it cannot be read."""
     parts = source_parts(path)
-    if len(parts) > 1 or parts[0].name == SOG_META:
+    hashes = {part: content_hash(part) for part in parts}
+    size, name, digest = sum(part.stat().st_size for part in parts), parts[0].name, hashes[parts[0]]
+    if len(parts) > 1 or name == SOG_META:
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
-        hashes = "".join(f"{part.relative_to(folder).as_posix()} {content_hash(part)}\n" for part in parts)
-        total = sum(part.stat().st_size for part in parts)
-        return SourceFile(folder.resolve().name, total, hashlib.sha256(hashes.encode()).hexdigest())
-    digest = content_hash(parts[0])
-    return SourceFile(parts[0].name, parts[0].stat().st_size, digest)
+        lines = (f"{part.relative_to(folder).as_posix()} {digest}\n" for part, digest in hashes.items())
+        name, digest = folder.resolve().name, hashlib.sha256("".join(lines).encode()).hexdigest()
+    return SourceFile(name, size, digest)
 
 
 def source_parts(path: Path | str) -> list[Path]:
     """The files that a scene is read from: all of a SOG folder, by name, streamed or not, the checkpoint of a run, or
     one. Raises SceneError if a run has none, or a folder cannot be read."""
     path = Path(path)
-    parts = _sog_parts(path)
-    if parts:
-        return parts
+    folder = path.parent if path.name in (SOG_META, STREAM_META) else path
+    streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
+    if (streamed or (folder / SOG_META).is_file()) and not (folder / RUN_FILES.config).is_file():
+        with failure_named(folder, "read"):
+            images = (part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
+            return sorted(filter(Path.is_file, stream_parts(folder / STREAM_META) if streamed else images))
     if may_be_run(path) and not (path.is_file() and format_to_read(path)):
         return [open_run(path, need_data=False).checkpoint]
     return [path]
-
-
-def _sog_parts(path: Path) -> list[Path]:
-    """The files of a SOG folder, streamed or not, by name: its JSON and its images; none if the path is no such
-    folder."""
-    folder = path.parent if path.name in (SOG_META, STREAM_META) else path
-    streamed = path.name != SOG_META and (folder / STREAM_META).is_file()
-    if not (streamed or (folder / SOG_META).is_file()) or (folder / RUN_FILES.config).is_file():
-        return []
-    try:
-        if streamed:
-            names = sorted(stream_parts(folder / STREAM_META))
-        else:
-            names = sorted(part for part in folder.iterdir() if part.name == SOG_META or part.suffix.lower() == ".webp")
-        return [part for part in names if part.is_file()]
-    except OSError as error:
-        raise SceneError(f"{folder}: cannot be read ({error.strerror or one_line(error)})") from error

@@ -72,7 +72,7 @@ def _gsplat_antialiased(path: Path) -> bool:
 
 def _scene_of_gsplat(splats: dict[str, Any], path: Path) -> Gaussians:
     """The scene of gsplat's parameters: opacities (N,), and constant SH coefficients (N, 1, 3)."""
-    keys = {name: {"features_dc": "sh0", "features_rest": "shN"}.get(name, name) for name in PARAMETERS}
+    keys = dict(zip(PARAMETERS, PARAMETERS, strict=True)) | {"features_dc": "sh0", "features_rest": "shN"}
     held = {name: splats.get(key) for name, key in keys.items()}
     if isinstance(opacities := held["opacities"], Tensor) and opacities.dim() == 1:
         held["opacities"] = opacities[:, None]
@@ -120,17 +120,15 @@ def read_photo_fit(path: Path | str) -> PhotoFit:
     names = [key for key in state if isinstance(key, str)]
     key = next((name for name in names if name.endswith("camera_optimizer.pose_adjustment")), None)
     adjustments = None if key is None else _parameter(state[key], key, path, path.stat().st_size)
-    if adjustments is not None and not _is_adjustment(adjustments):
+    if adjustments is not None and not (
+        adjustments.dim() == 2 and adjustments.shape[1] == 6 and bool(adjustments.isfinite().all())
+    ):
         raise SceneError(
             f"{path}: {key!r} of shape {tuple(adjustments.shape)}; expected six finite numbers for each training photo"
         )
     words = re.compile(r"bil_?grid|bilateral|appearance|embed|exposure")
     colors = next((name for name in sorted(names) if name.startswith("_model.") and words.search(name)), "")
     return PhotoFit(adjustments, colors)
-
-
-def _is_adjustment(values: Tensor) -> bool:
-    return values.dim() == 2 and values.shape[1] == 6 and bool(values.isfinite().all())
 
 
 def is_complete(path: Path) -> bool:
@@ -173,14 +171,10 @@ def _load(path: Path) -> Any:
     except SceneError:
         raise
     except Exception as error:  # a damaged pickle can raise nearly anything
-        foreign = re.search(r"GLOBAL ([\w.]+)", str(error))
-        if foreign:
-            raise SceneError(
-                f"{path}: holds an object of type {foreign[1]}, which only running its code could load; {EXPECTED}"
-            ) from error
-        raise SceneError(
-            f"{path}: truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)}); {EXPECTED}"
-        ) from error
+        why = f"truncated or not a checkpoint ({type(error).__name__}: {one_line(error, 100)})"
+        if foreign := re.search(r"GLOBAL ([\w.]+)", str(error)):
+            why = f"holds an object of type {foreign[1]}, which only running its code could load"
+        raise SceneError(f"{path}: {why}; {EXPECTED}") from error
 
 
 def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
@@ -196,12 +190,10 @@ def _pipeline_state(content: Any, path: Path) -> dict[str, Any]:
 
 def _is_dense(value: Any) -> TypeGuard[Tensor]:
     """Whether a value is a tensor of plain numbers: not one that is nested, sparse, quantised or without content."""
-    return (
-        isinstance(value, Tensor)
-        and not value.is_nested
-        and (value.dtype, value.layout, value.device.type)
-        in {(dtype, torch.strided, "cpu") for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64)}
-    )
+    if not isinstance(value, Tensor) or value.is_nested:
+        return False
+    floats = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+    return value.dtype in floats and value.layout == torch.strided and value.device.type == "cpu"
 
 
 def _parameter(value: Any, key: str, path: Path, limit: int) -> Tensor:

@@ -23,9 +23,9 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.geometry.earth import Place
+from pointsplat_ns.io.files import need_folder, need_writable
 from pointsplat_ns.io.formats.holding import typical_sizes
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
-from pointsplat_ns.io.outputs import need_folder, need_writable
 from pointsplat_ns.io.scene import SourceFile
 from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.levels.errors import pixel_sizes

@@ -27,8 +27,7 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.io.ply_writing import header_bytes, ply_bytes, row_table
+from pointsplat_ns.io.ply import PlyRows, header_bytes, ply_bytes, row_table
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided

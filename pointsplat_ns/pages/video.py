@@ -13,8 +13,7 @@ import numpy as np
 from PIL import Image
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import one_line, replacing
-from pointsplat_ns.io.outputs import need_folder, need_writable
+from pointsplat_ns.io.files import need_folder, need_writable, one_line, replacing
 
 Kind = Literal["video", "frames", "picture"]
 

@@ -1,6 +1,6 @@
 """Making a scene smaller: pruning methods, budgets, SH bands."""
 
-from pointsplat_ns.io.ply_writing import ply_bytes
+from pointsplat_ns.io.ply import ply_bytes
 from pointsplat_ns.pruning.budget import (
     Keep,
     Megabytes,

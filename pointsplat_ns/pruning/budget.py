@@ -11,7 +11,7 @@ from numbers import Integral, Real
 
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import PLAIN, Traits
-from pointsplat_ns.io.formats.registry import WRITABLE, format_named, format_to_write
+from pointsplat_ns.io.formats import WRITABLE, format_named, format_to_write
 from pointsplat_ns.system.quantities import parse_count, parse_megabytes, parse_number
 
 KEEP_FORMS = (

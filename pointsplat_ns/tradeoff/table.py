@@ -13,8 +13,7 @@ import torch
 from pointsplat_ns.compression.quality import decibels
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.io.outputs import need_folder
+from pointsplat_ns.io.files import bytes_text, need_folder
 from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data

@@ -20,7 +20,7 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
-from pointsplat_ns.io.formats.rounding import Rounding, rounding_for
+from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, WithinPsnr, cut_sh, score_of, select
@@ -174,7 +174,7 @@ def test_a_size_rounds_as_far_as_the_scene_has_errors_already(suffix):
     assert len(found[25.0][0]) > 1.1 * len(found[35.0][0])
     for half, (scene, rounded, _) in found.items():
         wanted = rounding_for(few_psnr(psnr_of(half, scene), len(scene) / 4000), full.sh_degree)
-        assert rounded.rounding.tolerance == pytest.approx(wanted.tolerance)
+        assert rounded.rounding == pytest.approx(wanted)
         small = rounded.rounded(scene)
         assert len(small) == len(scene) and 0.9 * 32_000 < rounded.bytes_of(small) <= 32_000
 
@@ -189,7 +189,7 @@ def test_the_psnr_of_rounding_falls_by_the_slope_at_any_share(kept):
 
 
 def test_a_scene_is_rounded_as_far_as_its_size_needs():
-    scene, kind, usual = cloud(2000), format_to_write(".spz"), Rounding(0.002)
+    scene, kind, usual = cloud(2000), format_to_write(".spz"), 0.002
     size = FileLimit(kind, 10**9).bytes_of(kind.rounded(scene, usual))
     for most in (int(0.9 * size), size, int(1.05 * size)):
         found = FileLimit(kind, most, usual).bytes_of(FileLimit(kind, most, usual).rounded(scene))

@@ -14,12 +14,14 @@ from refusing import fails
 
 import pointsplat_ns as ps
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices, viewmats_to_opengl
-from pointsplat_ns.io import camera_files
-from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_views
-from pointsplat_ns.io.camera_files.cameras import CameraLimits
+from pointsplat_ns.io.camera_files import cameras, is_camera_file, read_named_views
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, written
 
 SEED = 3
+
+
+def read_views(path: Path) -> ps.Views:
+    return read_named_views(path).views
 
 
 def some_views(count: int = 12, width: int = 64, height: int = 48, centred: bool = False) -> ps.Views:
@@ -274,9 +276,9 @@ def test_missing_and_huge_files_and_other_folders_are_refused(tmp_path, monkeypa
     with pytest.raises(ps.DataError, match="cameras.bin: no such file; expected a COLMAP model"):
         read_views(folder)
     path = written(nerfstudio(some_views()), tmp_path / "transforms.json")
-    monkeypatch.setattr(cameras, "CAMERA_LIMITS", CameraLimits(cameras=3))
+    monkeypatch.setattr(cameras, "MOST_CAMERAS", 3)
     with pytest.raises(ps.DataError, match="12 cameras; expected 1 to 3"):
         read_views(path)
-    monkeypatch.setattr(camera_files, "CAMERA_LIMITS", CameraLimits(file_bytes=10))
-    with pytest.raises(ps.DataError, match="expected cameras of at most"):
+    os.truncate(path, 65_000_000)
+    with pytest.raises(ps.DataError, match="65 MB; expected cameras of at most 64 MB"):
         read_views(path)

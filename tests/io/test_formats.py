@@ -1,25 +1,146 @@
-"""Scene files of every format: what comes back, that the order is known, and that sizes are as said."""
+"""Scene files of every format: whatever its name, a file is what its content tells; what comes back; sizes."""
 
+import gzip
+import io
 import logging
 import struct
+import zipfile
 
 import numpy as np
 import pytest
+import torch
+from compressed_plys import encode_compressed_ply
 from foreign import encode_spz4, write_sog_folder
 from plys import columns_of, write_columns
+from refusing import fails
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, cloud, normal_scene, same_bits
-from pointsplat_ns.io.formats import format_to_read
-from pointsplat_ns.io.formats.registry import format_named
+from making import SHARED_DATA, cloud, normal_scene, same_bits, write_run
+from pointsplat_ns.io.discovery import find_scenes
+from pointsplat_ns.io.formats import format_like, format_named, format_to_read
+from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.spz import encode_spz
+from pointsplat_ns.io.scene import kind_of, source_file
 
-FIXED = (".ply", ".splat")
+SCENE = cloud(64, 3, 1)
+
+
+def zip_of(**files):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return stream.getvalue()
+
+
+def torch_bytes(content, **options):
+    stream = io.BytesIO()
+    torch.save(content, stream, **options)
+    return stream.getvalue()
+
+
+def checkpoint(step=7):
+    return {"step": step, "pipeline": {f"_model.gauss_params.{name}": value for name, value in SCENE.items()}}
+
+
+@pytest.fixture(scope="module")
+def contents(tmp_path_factory):
+    """Name of a format to the bytes of a file of it, and the scene that is read from them."""
+    folder = tmp_path_factory.mktemp("contents")
+    ps.save(SCENE, folder / "a.ply")
+    ply = (folder / "a.ply").read_bytes()
+    found = {
+        "3DGS PLY": (ply, ".ply"),
+        "compressed PLY": (encode_compressed_ply(SCENE), ".compressed.ply"),
+        "SPZ 3": (encode_spz(SCENE), ".spz"),
+        "SPZ 4": (encode_spz4(SCENE), ".spz"),
+        "SOG": (encode_sog(SCENE), ".sog"),
+        "checkpoint": (torch_bytes(checkpoint()), ".ckpt"),
+        "checkpoint of old torch": (torch_bytes(checkpoint(), _use_new_zipfile_serialization=False), ".ckpt"),
+    }
+    scenes = {}
+    for name, (data, suffix) in found.items():
+        (folder / f"right{suffix}").write_bytes(data)
+        scenes[name] = (data, ps.load(folder / f"right{suffix}"))
+    return scenes
+
+
+NAMES = ["x.ply", "x.spz", "x.splat", "x.ckpt", "x", "x.yml"]
+KINDS = {"SPZ 3": "SPZ", "SPZ 4": "SPZ", "checkpoint of old torch": "checkpoint"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_content_decides_for_every_format_under_every_name(tmp_path, contents, name):
+    for kind, (data, scene) in contents.items():
+        path = tmp_path / name
+        path.write_bytes(data)
+        assert same_bits(ps.load(path), scene), (kind, name)
+        assert kind_of(path) == KINDS.get(kind, kind), (kind, name)
+        assert source_file(path).name == name
+
+
+def test_a_renamed_file_is_written_again_as_what_it_is(tmp_path, contents):
+    for kind, wanted in (("3DGS PLY", ".ply"), ("compressed PLY", ".sog"), ("SPZ 3", ".spz"), ("SOG", ".sog")):
+        path = tmp_path / "x.splat"
+        path.write_bytes(contents[kind][0])
+        assert format_like(path).suffix == wanted
+    assert format_like(tmp_path / "none.splat").suffix == ".ply"
+
+
+def test_a_folder_is_searched_by_what_its_files_hold(tmp_path, contents, caplog):
+    (tmp_path / "a.ply").write_bytes(contents["SPZ 3"][0])
+    (tmp_path / "b.splat").write_bytes(contents["3DGS PLY"][0])
+    (tmp_path / "c.spz").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+    assert [*find_scenes(tmp_path)] == ["a", "b"]
+    assert "c.spz: no Gaussians in it" in caplog.text
+    (tmp_path / "d.ply").write_bytes(b"ply\n")
+    (tmp_path / "e.sog").write_bytes(contents["SOG"][0][:-50])  # a scene that is damaged is none that is passed over
+    assert [*find_scenes(tmp_path)] == ["a", "b", "e"]
+    assert "d.ply: no Gaussians in it" in caplog.text
+
+
+REFUSED = {
+    "x.ply": (zip_of(**{"document.json": "{}", "splat_0.ply": "ply\n"}), "SuperSplat project files are not read; open"),
+    "x.ssproj": (b"anything", "SuperSplat project"),
+    "x.zip": (zip_of(**{"lod-meta.json": "{}", "0_0/meta.json": "{}"}), "zip of a streamed SOG"),
+    "x.sog": (
+        zip_of(**dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), b"")),
+        "a zip archive of a.jpg, b.jpg, c.jpg and 1",
+    ),
+    "x.lcc": (b"{}", "LCC files are not read; convert it"),
+    "x.ksplat": (bytes(9000), "ksplat files are not read; convert it to .ply or .sog"),
+    "x.spz": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "Git LFS pointer"),
+    "y.ply": (b"<!DOCTYPE html><html>", "web page"),
+    "y.splat": (b"LASF" + bytes(60), "LAS point cloud"),
+    "z.ply": (b"PXR-USDC" + bytes(60), "USD files are not read"),
+    "y.zip": (zip_of(**{"room/a.ply": "ply\n"}), "zip of a PLY files are not read; unpack it and name the PLY"),
+    "z.zip": (zip_of(**{"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
+    "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
+    "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
+    "x.glb": (b"glTF" + bytes(60), "glTF files are not read; export the scene"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_not_read_is_refused_by_what_it_is(tmp_path, name):
+    data, said = REFUSED[name]
+    (tmp_path / name).write_bytes(data)
+    assert fails(lambda: ps.load(tmp_path / name), said, error=ps.SceneError).startswith(str(tmp_path / name))
+
+
+def test_info_names_runs_and_checkpoints_in_them_with_method_and_step(tmp_path, capsys):
+    path = write_run(tmp_path / "run", 8, 100)
+    torch.save(checkpoint(), path)
+    config = tmp_path / "run" / "config.yml"
+    config.write_text(config.read_text().replace("max_num", "method_name: splatfacto-big\nmax_num", 1))
+    names = [ps.info(place).format for place in (tmp_path / "run", config, path)]
+    assert names == ["run of splatfacto-big, step 7"] * 2 + ["checkpoint of splatfacto-big, step 7"]
+
 
 SPLATS = SHARED_DATA / "splats"
 
 
-@pytest.mark.parametrize("suffix", FIXED)
+@pytest.mark.parametrize("suffix", [".ply", ".splat"])
 def test_the_size_of_a_file_is_known_to_the_byte(tmp_path, suffix):
     bytes_of = format_named(suffix).bytes_of
     for n, degree in ((0, 0), (1, 3), (255, 1), (256, 2), (257, 0), (1001, 3)):

@@ -11,8 +11,10 @@ import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.formats import FORMATS
+from pointsplat_ns.io.formats.coding import morton_order
 from pointsplat_ns.io.formats.holding import FLOAT, losses, seen_colours, within_colours
-from pointsplat_ns.io.formats.spz_range import COLOURS, FARTHEST, SH, fraction_bits
+from pointsplat_ns.io.formats.splat import drawing_order
+from pointsplat_ns.io.formats.spz import FARTHEST, HOLDS, fraction_bits
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 
 WRITTEN = [kind for kind in FORMATS if kind.write is not None]
@@ -88,7 +90,7 @@ def with_floaters(scene):
 def test_spz_brings_a_handful_of_far_gaussians_in_and_counts_them(tmp_path, caplog):
     scene = with_floaters(room())
     assert psnr_of_file(scene, tmp_path / "a.spz") > 44  # 38 dB where they stay
-    assert "3 Gaussians lie farther than 2048 units and are moved to there, smaller in proportion" in loss_text(caplog)
+    assert "Gaussians farther than 2048 units, 3 of them, are moved to there, smaller" in loss_text(caplog)
     back = ps.load(tmp_path / "a.spz")
     assert torch.equal(back[:-3].means, (room().means * 4096).round() / 4096)
     centre = room().means.median(dim=0).values
@@ -112,12 +114,21 @@ def with_dark(scene):
     return scene.replace(features_dc=dc, features_rest=rest)
 
 
+def test_a_few_gaussians_smaller_than_the_step_of_positions_are_named(tmp_path, caplog):
+    scene = room()
+    few = torch.arange(len(scene)) < len(scene) // 100
+    scene = scene.replace(scales=torch.where(few[:, None], torch.full_like(scene.scales, -9.5), scene.scales))
+    ps.save(scene, tmp_path / "a.spz")
+    assert "of the Gaussians are rounded by more than their size" in loss_text(caplog)
+
+
 def test_spz_lowers_base_and_sh_together_and_names_what_is_lost(tmp_path, caplog):
     scene = with_dark(room())
     after = psnr_of_file(scene, tmp_path / "a.spz")
     assert "of the Gaussians have colours outside of its range" in loss_text(caplog)
     cut = scene.replace(
-        features_dc=scene.features_dc.clamp(COLOURS.low, COLOURS.high), features_rest=scene.features_rest.clamp(-1, 1)
+        features_dc=scene.features_dc.clamp(HOLDS.colours.low, HOLDS.colours.high),
+        features_rest=scene.features_rest.clamp(-1, 1),
     )
     with torch.no_grad():
         cut_apart = float(ps.psnr(ps.render(cut, views()), ps.render(scene, views())).mean())
@@ -135,7 +146,7 @@ def test_a_splat_names_sh_and_antialiasing_that_it_does_not_hold(tmp_path, caplo
 def test_colours_of_any_size_are_brought_into_range_without_nan(value):
     scene = cloud(4, 0, 3)
     scene = scene.replace(features_dc=torch.full((4, 3), value), features_rest=scene.features_rest * abs(value))
-    for colours, sh in ((COLOURS, SH), (FLOAT, SH)):
+    for colours, sh in ((HOLDS.colours, HOLDS.sh), (FLOAT, HOLDS.sh)):
         fitted = within_colours(scene, colours, sh)
         assert bool(fitted.features_dc.isfinite().all()) and bool(sh.holds(fitted.features_rest).all())
     for kind in WRITTEN:
@@ -179,7 +190,8 @@ def test_numbers_in_range_come_back_within_half_a_step(tmp_path, kind, degree, n
         features_rest=numbers(holds.sh, -6.0, 6.0, n, k, 3) if holds.sh and k else torch.zeros(n, 0, 3),
     )
     ps.save(scene, tmp_path / f"a{kind.suffix}")
-    before, after = scene if kind.order is None else scene[kind.order(scene)], ps.load(tmp_path / f"a{kind.suffix}")
+    order = {".sog": morton_order, ".splat": drawing_order}.get(kind.suffix, lambda scene: slice(None))
+    before, after = scene[order(scene)], ps.load(tmp_path / f"a{kind.suffix}")
     assert after.sh_degree == (0 if holds.sh is None else degree)
     turns = torch.nn.functional.normalize(after.quats, dim=1)
     turns = turns * (turns * before.quats).sum(dim=1, keepdim=True).sign()

@@ -11,18 +11,16 @@ import pytest
 import pointsplat_ns as ps
 from making import cloud
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.io.files import write_json
 from pointsplat_ns.levels.folder import write_levels
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes that it forks")
 
 WORK = """
-import json, os, resource, shutil, signal, sys
+import os, resource, shutil, signal, sys
 from pathlib import Path
 import plyfile, torch
 import pointsplat_ns as ps
 from pointsplat_ns.levels.folder import write_levels
-from pointsplat_ns.io.files import write_json
 
 base = here = Path(sys.argv[1])
 new = ps.load(base / "new.ply")
@@ -33,7 +31,6 @@ def levels(scene, out):
 WRITERS = {
     "ply": lambda scene, out: ps.save(scene, out / "a.ply", overwrite=True),
     "sog": lambda scene, out: ps.save(scene, out / "a.sog", overwrite=True),
-    "json": lambda scene, out: write_json([len(scene)] * 300, out / "a.json"),
     "levels": levels,
 }
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.chmod")
@@ -89,7 +86,7 @@ for here in sorted(base.glob("*/*/")):
 """
 """Does the work of all tests here: forks children of one process that has imported everything, which takes seconds."""
 
-KINDS = {"killed": ("ply", "json", "levels"), "full": ("ply", "sog")}
+KINDS = {"killed": ("ply", "levels"), "full": ("ply", "sog")}
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +113,7 @@ def shown(folder: Path) -> dict[str, bytes]:
 
 def write_old(kind: str, out: Path) -> None:
     old = cloud(30, 3, 0)
-    if kind == "json":
-        write_json([30] * 300, out / "a.json")
-    elif kind == "levels":
+    if kind == "levels":
         write_levels(out / "lod", [old], {}, [{}])
     else:
         ps.save(old, out / f"a.{kind}")

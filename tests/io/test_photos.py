@@ -128,29 +128,22 @@ def test_photos_are_reduced_while_read_and_never_enlarged(tmp_path):
     assert PhotoReader(tmp_path, 10_000).size(path, shot) == (800, 600)
 
 
-def test_alpha_is_laid_over_black_and_masks_count_where_white(tmp_path):
-    pixels = noise(channels=4)
+@pytest.mark.parametrize("name", ["a.png.png", "a.png", "named.png"])
+def test_masks_count_where_white_and_alpha_is_laid_over_black(name, tmp_path):
+    """Beside the folder of photos under their names, or as the cameras name them."""
+    pixels, mask = noise(channels=4), np.zeros((96, 128), np.uint8)
     pixels[:, :32, 3], pixels[:, 32:, 3] = 0, 255
-    mask = np.zeros((96, 128), np.uint8)
     mask[:48] = 255
-    saved(mask, tmp_path / "masks" / "a.png")
-    photo = PhotoReader(tmp_path, 1000).read(saved(pixels, tmp_path / "a.png"), camera(mask="masks/a.png"))
-    assert not photo.image[:, :32].any() and torch.equal(photo.image[:, 32:], torch.from_numpy(pixels[:, 32:, :3]))
-    assert photo.mask is not None and photo.mask[:24].all() and not photo.mask[24:].any()
-
-
-@pytest.mark.parametrize("name", ["a.png.png", "a.png"])
-def test_masks_beside_the_folder_of_photos_count_where_cameras_name_none(name, tmp_path):
-    path = saved(noise(), tmp_path / "images" / "left" / "a.png")
-    mask = np.zeros((48, 64), np.uint8)
-    mask[:24] = 255
+    path = saved(pixels, tmp_path / "images" / "left" / "a.png")
     saved(mask, tmp_path / "masks" / "left" / name)
     reader = PhotoReader(tmp_path, 1000, tmp_path / "images")
-    photo = reader.read(path, camera())
+    shot = camera(mask="masks/left/named.png" if name == "named.png" else "")
+    photo = reader.read(path, shot)
+    assert not photo.image[:, :32].any() and torch.equal(photo.image[:, 32:], torch.from_numpy(pixels[:, 32:, :3]))
     assert photo.mask is not None and photo.mask[:24].all() and not photo.mask[24:].any()
     (tmp_path / "masks" / "left" / name).write_bytes(b"no mask")
     with pytest.raises(DataError, match=f"{name}: cannot be read as a mask"):
-        reader.read(path, camera())
+        reader.read(path, shot)
     assert reader.read(saved(noise(), tmp_path / "images" / "b.png"), camera()).mask is None
 
 

@@ -18,7 +18,7 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io import ply, read_ply, write_ply
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.palette import codebook
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, rounding_for, steps_of
+from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for, steps_of
 from pointsplat_ns.merging.covariance import covariances, unpack
 
 SILENT = lambda *told: None  # noqa: E731
@@ -69,7 +69,7 @@ def test_extremes_stay_finite_and_usable():
     )
     for suffix in (".spz", ".sog"):
         for tolerance in (1e-12, 0.01, 1.0, 1e6):
-            small = format_to_write(suffix).rounded(scene, Rounding(tolerance))
+            small = format_to_write(suffix).rounded(scene, tolerance)
             assert len(small) == 6 and bool(small.usable().all()), (suffix, tolerance)
 
 
@@ -78,7 +78,7 @@ def test_files_become_smaller_and_keep_what_was_rounded(suffix, tmp_path):
     room, kind = ps.example_room()[::20], format_to_write(suffix)
     sizes, tolerances = [], (0.0, 0.01, 0.04)
     for tolerance in tolerances:
-        small = kind.rounded(room, Rounding(tolerance))
+        small = kind.rounded(room, tolerance)
         kind.write(small, tmp_path / f"a{suffix}", SILENT)
         kind.write(ps.load(tmp_path / f"a{suffix}"), tmp_path / f"b{suffix}", SILENT)
         first, second = ((tmp_path / f"{name}{suffix}").stat().st_size for name in "ab")
@@ -99,21 +99,13 @@ def test_rows_of_any_order_and_type_are_read_in_pieces_as_in_whole(tmp_path):
     assert same_bits(read_ply(tmp_path / "a.ply"), scene)
 
 
-def test_rows_are_refused_as_whole_files_are_and_when_a_file_shrinks(tmp_path):
+def test_rows_of_a_file_that_shrinks_are_refused(tmp_path):
     write_ply(cloud(50), tmp_path / "a.ply")
-    data = (tmp_path / "a.ply").read_bytes()
     rows = ply.PlyRows.open(tmp_path / "a.ply")
     assert rows is not None
-    (tmp_path / "a.ply").write_bytes(data[:-9])
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-9])
     with pytest.raises(SceneError, match="truncated while it was read; expected 50 Gaussians"):
         rows.read(40, 50)
-    with pytest.raises(SceneError, match="declares 50 Gaussians of .* the file holds 49"):
-        ply.PlyRows.open(tmp_path / "a.ply")
-    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 50", b"vertex 1000000000000000"))
-    with pytest.raises(SceneError, match="declares 1000000000000000 Gaussians"):
-        ply.PlyRows.open(tmp_path / "a.ply")
-    with pytest.raises(SceneError, match="no such file"):
-        ply.PlyRows.open(tmp_path / "b.ply")
 
 
 def rows_of(n, dims, seed=0):
@@ -130,13 +122,13 @@ def test_sh_of_few_different_rows_keep_them(different):
     rest = format_to_write(".sog").rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding).features_rest
     assert 0.95 * different <= len(rest.flatten(1).unique(dim=0)) <= different
     error = float((rest - rows).square().mean().sqrt())
-    assert error < ROUNDING.palette_error * rounding.tolerance / (SH_C0 * 3**0.5)
+    assert error < ROUNDING.palette_error * rounding / (SH_C0 * 3**0.5)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.02])
 def test_codebooks_are_listed_in_few_digits_and_read_back_to_the_bit(tolerance, tmp_path):
     kind = format_to_write(".sog")
-    scene = kind.rounded(ps.example_room()[::20], Rounding(tolerance))
+    scene = kind.rounded(ps.example_room()[::20], tolerance)
     kind.write(scene, tmp_path / "a.sog", SILENT)
     meta = json.loads(zipfile.ZipFile(tmp_path / "a.sog").read("meta.json"))
     for name, values in (("scales", scene.scales), ("sh0", scene.features_dc)):

@@ -15,15 +15,6 @@ from pointsplat_ns.gaussians import Traits
 from pointsplat_ns.geometry.transforms import direction_of
 from pointsplat_ns.rasterizer.scene import pixels_of
 
-AXIS = "-x"
-"""Up in these tests, which no estimate would choose."""
-
-
-@pytest.fixture(scope="module")
-def room() -> ps.Gaussians:
-    """Just as large as merging needs to look at it from views."""
-    return ps.example_room()[::25]
-
 
 def trained_so(scene):
     return scene.replace(antialiased=True)

@@ -15,8 +15,7 @@ from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
-from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.io.ply_writing import header_bytes, row_table
+from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.merging import MERGING, MergeSettings, merge
 from pointsplat_ns.merging.by_cells import merge_file

@@ -13,7 +13,6 @@ from pathlib import Path, PurePosixPath
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import (
-    CAMERA_LIMITS,
     Camera,
     CameraFile,
     Motion,
@@ -25,7 +24,7 @@ from pointsplat_ns.io.camera_files.colmap import colmap_cameras, model_folder
 from pointsplat_ns.io.camera_files.json_cameras import inria_cameras, nerfstudio_cameras
 from pointsplat_ns.io.files import logger, one_line, require_file, require_memory
 from pointsplat_ns.io.formats import SOG_META, STREAM_META, format_named
-from pointsplat_ns.io.runs import RUN_FILES, read_transforms
+from pointsplat_ns.io.runs import RUN_FILES, may_be_run, read_transforms
 from pointsplat_ns.views import Views
 
 CAMERA_KINDS = "cameras.json of 3DGS, transforms.json of nerfstudio, or the folder of a COLMAP model or project"
@@ -36,8 +35,7 @@ class NamedViews:
     """Views of a file of cameras, and where their photos may lie."""
 
     views: Views
-    names: Sequence[str]
-    """Of the photo of each view, as the file has it; empty if it has none."""
+    """float64 on the CPU, over black, in the order of the names of their photos."""
     folders: Sequence[Path]
     """Where photos may lie: beside the file, in ScanNet++'s folder of photos, or for a COLMAP model in the folders
     ``images`` of the project."""
@@ -47,6 +45,11 @@ class NamedViews:
     """The motion of the dataset's world before the file was saved, see :class:`~cameras.CameraFile`."""
     motion: Motion | None
     """What moved the poses of the file into the frame of the scene; None if nothing did."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of the photo of each view, as the file has it; empty if it has none."""
+        return [camera.name for camera in self.cameras]
 
     @property
     def in_scene_frame(self) -> bool:
@@ -71,7 +74,7 @@ def is_camera_file(path: Path | str) -> bool:
         return model_folder(path) is not None or not any(
             (path / name).is_file() for name in (RUN_FILES.config, SOG_META, STREAM_META)
         )
-    return path.suffix.lower() not in RUN_FILES.suffixes and format_named(path.name) is None
+    return not may_be_run(path) and format_named(path.name) is None
 
 
 def camera_files_near(scene: Path) -> list[Path]:
@@ -91,7 +94,7 @@ def transforms_beside(path: Path | str) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def read_views(path: Path | str, transforms: Path | None = None) -> Views:
+def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
     """Read the cameras of a file.
 
     Lens distortion is ignored, which is logged. Cameras whose pictures have another size than most get that size: they
@@ -102,9 +105,6 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
         transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of
             ``transforms.json`` and of COLMAP into the frame of the scene. By default the one beside ``path``, if there
             is one. Poses of ``cameras.json`` are in the scene's frame already.
-
-    Returns:
-        C views, float64 on the CPU, over black, in the order of the names of their photos.
 
     Raises:
         SceneError: if there is no such file, or the transforms are not usable.
@@ -117,18 +117,15 @@ def read_views(path: Path | str, transforms: Path | None = None) -> Views:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder, "transforms.json")
         ...     _ = path.write_text(json.dumps(content))
-        ...     views = read_views(path)
+        ...     views = read_named_views(path).views
         >>> len(views), views.width, views.height
         (1, 64, 48)
     """
-    return read_named_views(path, transforms).views
-
-
-def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedViews:
-    """As :func:`read_views`, with where the photos may lie."""
     path = Path(path)
     model = model_folder(path)
     found = _json_cameras(path) if model is None else colmap_cameras(path)
+    if bent := sum(camera.bent for camera in found.cameras):
+        logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found.cameras))
     folders = [path.parent, path.absolute().parent.parent / "resized_images"]
     if model is not None:
         folders = [above / "images" for above in (model, *model.absolute().parents[:3])]
@@ -138,11 +135,9 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
         exact = rigid(transform.double()[None], f"{transforms}: its transform")[0]
         logger.info("%s: poses are moved into the frame of the scene, as %s says", path, transforms)
         motion = found.saved.undone_before(Motion(exact, scale))
-    names = [camera.name for camera in found.cameras]
-    views = checked_views(path, found.cameras, motion)
-    order = photo_order(names)
-    cameras = [found.cameras[index] for index in order]
-    return NamedViews(views, [names[index] for index in order], folders, cameras, found.saved, motion)
+    order = photo_order([camera.name for camera in found.cameras])
+    views = checked_views(path, found.cameras, motion)[order]
+    return NamedViews(views, folders, [found.cameras[index] for index in order], found.saved, motion)
 
 
 def _json_cameras(path: Path) -> CameraFile:
@@ -152,11 +147,9 @@ def _json_cameras(path: Path) -> CameraFile:
             f"{path}: a folder without cameras.bin or cameras.txt, there or in sparse/0; expected {CAMERA_KINDS}"
         )
     path = require_file(path, CAMERA_KINDS)
-    size = path.stat().st_size
-    if size > CAMERA_LIMITS.file_bytes:
-        raise DataError(
-            f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {CAMERA_LIMITS.file_bytes / 1e6:.0f} MB"
-        )
+    size, most = path.stat().st_size, 64_000_000  # 100,000 frames have about as much
+    if size > most:
+        raise DataError(f"{path}: {size / 1e6:.0f} MB; expected cameras of at most {most / 1e6:.0f} MB")
     require_memory(path, 24 * size)  # most memory that a byte of JSON takes: empty lists are the worst
     try:
         content = json.loads(path.read_bytes())

@@ -18,23 +18,8 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 from pointsplat_ns.views import Views
 
-
-@dataclass(frozen=True)
-class CameraLimits:
-    """Limits of files of cameras."""
-
-    file_bytes: int = 64_000_000
-    """Maximum size of JSON: 100,000 frames have about as much."""
-    cameras: int = 100_000
-    pixels: int = 100_000
-    """Maximum of a photo's width and height."""
-    coordinate: float = 1e9
-    """Largest coordinate of a camera: squares of it are numbers in float32."""
-    deviation: float = 1e-3
-    """Largest deviation of a rotation; text of four digits has less."""
-
-
-CAMERA_LIMITS = CameraLimits()
+MOST_CAMERAS = 100_000
+"""Largest number of cameras in a file."""
 
 
 class Camera(NamedTuple):
@@ -56,6 +41,11 @@ class Camera(NamedTuple):
     """Its parameters after the principal point."""
     mask: str = ""
     """Name of the file of the pixels that count; empty if all do."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether the lens has distortion."""
+        return "FISHEYE" in self.model or "k4" in self.model or any(self.distortion)
 
 
 @dataclass(frozen=True)
@@ -125,11 +115,10 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
     """
     turn = values[:, :3, :3]
     off = (turn @ turn.transpose(1, 2) - torch.eye(3, dtype=values.dtype, device="cpu")).abs().amax((1, 2))
-    good = (
-        values.isfinite().all(2).all(1) & (off <= CAMERA_LIMITS.deviation) & (torch.linalg.det(turn) > 0)
-    )  # NaN fails too
+    most = 1e-3  # text of four digits is off by less
+    good = values.isfinite().all(2).all(1) & (off <= most) & (torch.linalg.det(turn) > 0)  # NaN fails too
     if values.shape[1] == 4:
-        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= CAMERA_LIMITS.deviation).all(1)
+        good &= ((values[:, 3] - values.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= most).all(1)
     if not bool(good.all()):
         camera = f" of camera {_first_bad(good, names)}" if names else ""
         raise DataError(
@@ -142,8 +131,8 @@ def rigid(values: Tensor, whose: str, names: Sequence[str] = ()) -> Tensor:
     return exact
 
 
-def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None = None) -> Views:
-    """Cameras as views over black, sorted by the names of their photos, r_2 before r_10.
+def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None) -> Views:
+    """Cameras as views over black.
 
     Views have one size. Cameras of another size than the most common one see the same field of view at that size: their
     intrinsics are stretched, width and height each by itself.
@@ -151,7 +140,7 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     Args:
         path: of the file, for errors.
         cameras: what it has.
-        motion: what moves its world to the scene's.
+        motion: what moves its world to the scene's; None for nothing.
 
     Returns:
         C views, float64 on the CPU.
@@ -168,13 +157,13 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     sizes, focals, centres = (
         torch.tensor([camera[field] for camera in cameras], **DOUBLES).view(-1, 2) for field in (2, 3, 4)
     )
-    reached = poses[:, :3, 3].abs().amax(1) <= CAMERA_LIMITS.coordinate
-    whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= CAMERA_LIMITS.pixels)).all(1)
+    reached = poses[:, :3, 3].abs().amax(1) <= 1e9  # squares of it are numbers in float32
+    whole = ((sizes == sizes.floor()) & (sizes >= 1) & (sizes <= 100_000)).all(1)
     long = ((focals >= 1e-3 * sizes) & (focals <= 1e5 * sizes)).all(1)  # fields of view of 179.9 and 0.0006 degrees
     near = (centres.abs() <= 100.0 * sizes).all(1)  # at most 100 sides of the picture away from its corner
     for good, what, expected in (
-        (reached, "is too far away", f"at most {CAMERA_LIMITS.coordinate:g} units"),
-        (whole, "has a picture of no usable size", f"1 to {CAMERA_LIMITS.pixels} pixels a side"),
+        (reached, "is too far away", "at most 1e9 units"),
+        (whole, "has a picture of no usable size", "1 to 100,000 pixels a side"),
         (long, "has no usable focal length", "a positive number of pixels"),
         (near, "has its principal point far outside of the picture", "one in or near it"),
     ):
@@ -186,13 +175,11 @@ def checked_views(path: Path, cameras: Sequence[Camera], motion: Motion | None =
     stretch = sizes.new_tensor([width, height]) / sizes
     Ks = torch.eye(3, **DOUBLES).repeat(len(cameras), 1, 1)
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = focals * stretch, centres * stretch
-    order = photo_order(names)
-    return Views(invert_rigid(poses)[order], Ks[order], width, height, torch.zeros(3, **FLOATS))
+    return Views(invert_rigid(poses), Ks, width, height, torch.zeros(3, **FLOATS))
 
 
 def photo_order(names: Sequence[str]) -> list[int]:
-    """Indices of cameras in the order of the names of their photos, digits counted as numbers; as they are if one has
-    no name."""
+    """Indices of cameras in the order of the names of their photos, r_2 before r_10; as they are if one has no name."""
     order = list(range(len(names)))
     if all(names):
         order.sort(key=lambda index: re.sub(r"\d+", lambda digits: digits[0].zfill(20), names[index]))
@@ -201,8 +188,8 @@ def photo_order(names: Sequence[str]) -> list[int]:
 
 def need_count(path: Path, count: int) -> None:
     """Raise a DataError for a file of no camera, or of too many."""
-    if not 0 < count <= CAMERA_LIMITS.cameras:
-        raise DataError(f"{path}: {count} cameras; expected 1 to {CAMERA_LIMITS.cameras}")
+    if not 0 < count <= MOST_CAMERAS:
+        raise DataError(f"{path}: {count} cameras; expected 1 to {MOST_CAMERAS}")
 
 
 def _first_bad(good: Tensor, names: Sequence[str]) -> str:

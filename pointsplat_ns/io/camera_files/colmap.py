@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
-from pointsplat_ns.io.camera_files.cameras import CAMERA_LIMITS, Camera, CameraFile, Motion, need_count
+from pointsplat_ns.io.camera_files.cameras import MOST_CAMERAS, Camera, CameraFile, Motion, need_count
 from pointsplat_ns.io.files import logger, one_line
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -36,21 +36,6 @@ point follows the focal lengths, and the distortion that."""
 
 _LONGEST_LINE = 4096
 """Of a camera or an image, bytes; also of the name of a photo. Lines of points are longer, and skipped in pieces."""
-
-
-class _Lens(NamedTuple):
-    """A camera of COLMAP: what took some of the images."""
-
-    size: tuple[float, float]
-    focal: tuple[float, float]
-    centre: tuple[float, float]
-    model: str
-    distortion: tuple[float, ...]
-
-    @property
-    def bent(self) -> bool:
-        """Whether it has distortion."""
-        return "FISHEYE" in self.model or any(self.distortion)
 
 
 class _Image(NamedTuple):
@@ -98,16 +83,13 @@ def colmap_cameras(path: Path) -> CameraFile:
             f"{images_path}: {lost.name[:60]} was taken by camera {lost.camera}, which {cameras_path.name} lacks; "
             "expected two files of one model"
         )
-    bent = sum(lenses[image.camera].bent for image in images)
-    if bent:
-        logger.info("%s: the lens distortion of %d of %d cameras is ignored", folder, bent, len(images))
     poses = torch.tensor([image.pose for image in images], **DOUBLES)
     matrices = invert_rigid(torch.cat([rotation_matrices(poses[:, :4]), poses[:, 4:, None]], dim=2))
     # The length of a quaternion is free, within what can be squared. Others become NaN, which is refused with its name.
     lengths = poses[:, :4].norm(dim=1)
     matrices[~((lengths > 1e-6) & (lengths < 1e6))] = torch.nan
     cameras = [
-        Camera(image.name, pose, *lenses[image.camera])
+        lenses[image.camera]._replace(name=image.name, pose=pose)
         for image, pose in zip(images, matrices.flatten(1).tolist(), strict=True)
     ]
     return CameraFile(cameras, Motion(torch.eye(4, **DOUBLES)[:3]))
@@ -148,14 +130,14 @@ def _text_points(stream: BinaryIO, path: Path) -> Iterator[tuple[float, ...]]:
         begins = line.endswith(b"\n")
 
 
-def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> _Lens:
+def _lens(name: str, size: tuple[float, float], params: tuple[float, ...]) -> Camera:
+    """A camera of COLMAP, without a photo and a pose: what took some of the images."""
     _, focals, _ = COLMAP_CAMERAS[name]
-    return _Lens(
-        size, (params[0], params[focals - 1]), (params[focals], params[focals + 1]), name, params[focals + 2 :]
-    )
+    focal, centre = (params[0], params[focals - 1]), (params[focals], params[focals + 1])
+    return Camera("", (), size, focal, centre, name, params[focals + 2 :])
 
 
-def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
+def _text_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
     """The lines "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"."""
     lenses = {}
     for line in _lines(stream, path):
@@ -207,7 +189,7 @@ def _lines(stream: BinaryIO, path: Path) -> Iterator[str]:
             yield text
 
 
-def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, _Lens]:
+def _binary_lenses(stream: BinaryIO, path: Path) -> dict[int, Camera]:
     """A count, and for each camera its number, model, width, height and parameters."""
     names = {number: name for name, (number, _, _) in COLMAP_CAMERAS.items()}
     lenses = {}
@@ -246,9 +228,9 @@ def _count(stream: BinaryIO, path: Path, least: int) -> int:
     """The count that a binary file begins with, checked against its size; ``least`` bytes follow for each."""
     (count,) = struct.unpack("<Q", _exactly(stream, 8, path))
     room = (os.fstat(stream.fileno()).st_size - 8) // least
-    if not 0 < count <= min(room, CAMERA_LIMITS.cameras):
+    if not 0 < count <= min(room, MOST_CAMERAS):
         raise DataError(
-            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {CAMERA_LIMITS.cameras}, "
+            f"{path}: says that it has {count} entries and has room for {room}; expected 1 to {MOST_CAMERAS}, "
             "as COLMAP writes them"
         )
     return count

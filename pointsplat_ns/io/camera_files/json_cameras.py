@@ -21,7 +21,6 @@ import torch
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.io.camera_files.cameras import Camera, CameraFile, Motion, finite, matrix, need_count, rigid
-from pointsplat_ns.io.files import logger
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
@@ -33,16 +32,12 @@ def nerfstudio_cameras(content: dict[str, Any], path: Path) -> CameraFile:
     distortion = ("k1", "k2", "k3", "k4", "p1", "p2")
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "camera_model", *distortion)
     found = []
-    bent = 0
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: camera {index} is no frame; expected an object with 'transform_matrix'")
         # A frame may have none of these, or hundreds of others.
         said = {name: frame.get(name, content.get(name)) for name in names}
         found.append(_camera(frame, said, index, path))
-        bent += said["camera_model"] in ("OPENCV_FISHEYE", "FISHEYE") or any(finite(said[k]) for k in distortion)
-    if bent:
-        logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found))
     return CameraFile(found, _saved_motion(content, path))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import lzma
+import math
 import struct
 import zipfile
 import zlib
@@ -22,10 +23,6 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import interleave, spread_bits, zero_as_identity
 from pointsplat_ns.io.files import one_line, require_memory
 from pointsplat_ns.system.tensors import INDICES
-
-PACKED = 100
-"""Most bytes that a compressed byte is taken to hold. 216,000 Gaussians that differ in nothing but their place on a
-grid have 27; trained scenes less than 4."""
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
@@ -63,8 +60,9 @@ def require_plausible(path: Path, unpacked: int, packed: int, count: int, rest: 
     """Raise a SceneError, before memory is taken, if the header of a compressed file declares more bytes than
     ``packed`` can hold, or more Gaussians (with ``rest`` SH coefficients per channel beyond the constant one) than fit
     into memory."""
-    # From a file of any size 4 MB, 200,000 equal Gaussians.
-    if unpacked > max(1 << 22, PACKED * packed):
+    # A compressed byte holds at most 100: 216,000 Gaussians that differ in nothing but their place on a grid have 27,
+    # trained scenes less than 4. A file of any size may hold 4 MB, 200,000 equal Gaussians.
+    if unpacked > max(1 << 22, 100 * packed):
         raise SceneError(
             f"{path}: the header declares {count} Gaussians of {unpacked} bytes in all, more than {packed} compressed "
             "bytes can hold"
@@ -76,22 +74,16 @@ class Blocks:
     """Arrays that follow one another in the bytes of a file, from ``start`` on."""
 
     def __init__(self, data: bytes | memoryview, path: Path, start: int = 0):
-        self._data, self._path, self.position = data, path, start
-
-    def __len__(self) -> int:
-        return len(self._data)
+        self._data, self._path, self._position = data, path, start
 
     def take(self, dtype: str | np.dtype, *shape: int) -> NDArray:
         """The next array, not copied; a SceneError if the bytes end before it does."""
-        kind = np.dtype(dtype)
-        count = int(np.prod([int(side) for side in shape], dtype=object))
-        left = len(self._data) - self.position
-        if count * kind.itemsize > left:
-            raise SceneError(
-                f"{self._path}: truncated; {count * kind.itemsize} bytes expected at byte {self.position}, found {left}"
-            )
-        array = np.frombuffer(self._data, kind, count, self.position).reshape(shape)
-        self.position += count * kind.itemsize
+        count, left = math.prod(int(side) for side in shape), len(self._data) - self._position
+        size = count * np.dtype(dtype).itemsize
+        if size > left:
+            raise SceneError(f"{self._path}: truncated; {size} bytes expected at byte {self._position}, found {left}")
+        array = np.frombuffer(self._data, dtype, count, self._position).reshape(shape)
+        self._position += size
         return array
 
 
@@ -130,11 +122,6 @@ def bytes_of_logits(scene: Gaussians) -> Array:
     return to_bytes(255 * scene.alphas.double())
 
 
-def dc_of_shares(shares: Array) -> Array:
-    """Constant SH coefficients of colours, where 0 is black and 1 white."""
-    return ((shares - 0.5) / SH_C0).astype(np.float32)
-
-
 def shares_of_dc(scene: Gaussians) -> Array:
     """Colours (N, 3) of the constant SH coefficients, float64; they may lie outside [0, 1]."""
     return 0.5 + SH_C0 * scene.features_dc.double().numpy()
@@ -143,17 +130,6 @@ def shares_of_dc(scene: Gaussians) -> Array:
 def to_bytes(values: Array | Tensor) -> Array:
     """Numbers rounded to the nearest byte."""
     return np.clip(np.rint(np.asarray(values)), 0, 255).astype(np.uint8)
-
-
-def log_of_sizes(sizes: Array) -> Array:
-    """Log-scales of standard deviations. Zero is -Inf, a flat axis; a negative size is NaN and dropped by readers."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(sizes.astype(np.float32))
-
-
-def finite_sizes(scene: Gaussians) -> Array:
-    """Standard deviations (N, 3) as float32, the largest where that has none: infinity would be dropped by readers."""
-    return scene.stds.clamp_max(torch.finfo(torch.float32).max).numpy()
 
 
 def unit_quats(scene: Gaussians) -> Array:

@@ -12,21 +12,11 @@ import numpy as np
 
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians, sh_degree_of
+from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import require_file, require_memory
-from pointsplat_ns.io.formats.coding import (
-    Array,
-    Blocks,
-    damage_named,
-    dc_of_shares,
-    from_smallest_three,
-    load_bytes,
-    logits_of_bytes,
-    scene_of,
-)
+from pointsplat_ns.io.formats import coding
+from pointsplat_ns.io.formats.coding import Array, Blocks
 from pointsplat_ns.io.ply_header import Element, Header, read_header, traits_of
-
-CHUNK_GAUSSIANS = 256
-"""Gaussians that share bounds."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = tuple(
@@ -35,9 +25,6 @@ _BOUNDS = tuple(
     for end in ("min", "max")
     for name in names
 )
-_BITS_3 = ((21, 11), (11, 10), (0, 11))  # shift and number of bits of each of three numbers in a word
-_BITS_4 = ((24, 8), (16, 8), (8, 8))  # of four numbers; the last is opacity
-_ROTATION_BITS = ((20, 10), (10, 10), (0, 10))
 
 
 def is_compressed(header: Header) -> bool:
@@ -49,56 +36,52 @@ def read_compressed_ply(path: Path | str) -> Gaussians:
     """Read a compressed PLY, of any SH degree up to 3, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError
     if the file is no compressed PLY, is truncated, or does not fit into memory."""
     path = require_file(path, "a compressed PLY file")
-    with damage_named(path, "compressed PLY"):
+    with coding.damage_named(path, "compressed PLY"):
         with path.open("rb") as stream:
             header = read_header(stream, path)
-        elements = {element.name: element for element in header.elements}
-        chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
-        if chunk is None or vertex is None:
-            raise SceneError(f"{path}: lacks the element {'vertex' if chunk else 'chunk'!r}; expected a compressed PLY")
-        rest = _check(header, chunk, vertex, sh, path)
-        require_memory(path, path.stat().st_size + 4 * vertex.count * (14 + 3 * rest))
-        blocks = Blocks(load_bytes(path), path, header.size)
+        count, rest = _checked(header, path)
+        require_memory(path, path.stat().st_size + 4 * count * (14 + 3 * rest))
+        blocks = Blocks(coding.load_bytes(path), path, header.size)
         data = {element.name: blocks.take(_dtype(element), element.count) for element in header.elements}
-        scene = _decode(data["chunk"], data["vertex"], data.get("sh"), rest)
-        return scene.replace(**traits_of(header, path)._asdict())
+        return _decode(data["chunk"], data["vertex"], data.get("sh"), rest).replace(**traits_of(header, path)._asdict())
 
 
-def _check(header: Header, chunk: Element, vertex: Element, sh: Element | None, path: Path) -> int:
-    """SH coefficients per channel beyond the constant one; checks what the header declares against itself and the
-    file's size."""
+def _checked(header: Header, path: Path) -> tuple[int, int]:
+    """The number of Gaussians, and of SH coefficients per channel beyond the constant one; what the header declares is
+    checked against itself and the file's size."""
+    elements = {element.name: element for element in header.elements}
+    chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
+    if chunk is None or vertex is None:
+        raise SceneError(f"{path}: lacks the element {'vertex' if chunk else 'chunk'!r}; expected a compressed PLY")
     if header.order != "<":
         raise SceneError(f"{path}: a compressed PLY in another byte order or ASCII; expected binary_little_endian")
     listed = [name for element in header.elements for name in element.lists]
     if listed:
         raise SceneError(f"{path}: property {listed[0]!r} is a list; expected none in a compressed PLY")
-    colours = [name for name in _BOUNDS[12:] if name not in dict(chunk.properties)]
-    needed = {"chunk": (chunk, _BOUNDS[:12] if len(colours) == 6 else _BOUNDS), "vertex": (vertex, _PACKED)}
-    for name, (element, names) in needed.items():
-        kind = "float32" if name == "chunk" else "uint32"
-        wrong = [prop for prop in names if dict(element.properties).get(prop) != kind]
-        if wrong:
-            raise SceneError(f"{path}: element {name!r} lacks the {kind} property {wrong[0]!r}")
-    wanted = -(-vertex.count // CHUNK_GAUSSIANS)
+    coloured = all(name in dict(chunk.properties) for name in _BOUNDS[12:])
+    needed = [(chunk, "float32", name) for name in (_BOUNDS if coloured else _BOUNDS[:12])]
+    for element, kind, name in needed + [(vertex, "uint32", name) for name in _PACKED]:
+        if dict(element.properties).get(name) != kind:
+            raise SceneError(f"{path}: element {element.name!r} lacks the {kind} property {name!r}")
+    wanted = -(-vertex.count // 256)
     if chunk.count != wanted:
         raise SceneError(f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected {wanted}")
     rest = 0
     if sh is not None:
-        expected = [f"f_rest_{i}" for i in range(len(sh.properties))]
-        bad = [prop for prop, kind in sh.properties if kind != "uint8" or prop not in expected]
-        if bad or sh.count != vertex.count or len(expected) % 3:
+        rest = len(sh.properties) // 3
+        expected = {(f"f_rest_{i}", "uint8") for i in range(3 * rest)}
+        if set(sh.properties) != expected or sh.count != vertex.count:
             raise SceneError(
-                f"{path}: element 'sh' has {sh.count} rows of {len(expected)} properties; expected {vertex.count} rows "
-                "of f_rest_0, f_rest_1, ... of type uchar"
+                f"{path}: element 'sh' has {sh.count} rows of {len(sh.properties)} properties; expected {vertex.count} "
+                "rows of f_rest_0, f_rest_1, ... of type uchar"
             )
-        rest = len(expected) // 3
         sh_degree_of(rest)
     size = header.size + sum(element.count * element.row_bytes for element in header.elements)
     if size > path.stat().st_size:
         raise SceneError(
             f"{path}: truncated; {vertex.count} Gaussians declared, {size} bytes; found {path.stat().st_size}"
         )
-    return rest
+    return vertex.count, rest
 
 
 def _dtype(element: Element) -> np.dtype:
@@ -106,30 +89,29 @@ def _dtype(element: Element) -> np.dtype:
 
 
 def _decode(chunk: Array, vertex: Array, sh: Array | None, rest: int) -> Gaussians:
-    of = np.arange(len(vertex)) // CHUNK_GAUSSIANS
+    of = np.arange(len(vertex)) // 256
     position, rotation, scale, color = (vertex[name] for name in _PACKED)
 
-    def between(word: Array, bits: tuple[tuple[int, int], ...], names: tuple[str, ...]) -> Array:
-        shares = _unpack(word, bits)
+    def between(shares: Array, names: tuple[str, ...]) -> Array:
         if names[0] not in (chunk.dtype.names or ()):
             return shares
         low, high = (np.stack([chunk[name] for name in part], axis=1)[of] for part in (names[:3], names[3:]))
         return low + (high - low) * shares
 
-    tops = (rotation >> 30).astype(np.int64)
-    others = (_unpack(rotation, _ROTATION_BITS) - 0.5) * 2**0.5
     coefficients = np.empty((len(vertex), rest, 3), np.float32)
-    for i in range(3 * rest if sh is not None else 0):
-        assert sh is not None
-        level = sh[f"f_rest_{i}"].astype(np.float32)
-        share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
-        coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
-    return scene_of(
-        between(position, _BITS_3, _BOUNDS[:6]),
-        between(scale, _BITS_3, _BOUNDS[6:12]),
-        from_smallest_three(tops, others),
-        logits_of_bytes(color & 255),
-        dc_of_shares(between(color, _BITS_4, _BOUNDS[12:])),
+    if sh is not None:
+        for i in range(3 * rest):
+            level = sh[f"f_rest_{i}"].astype(np.float32)
+            share = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
+            coefficients[:, i % rest, i // rest] = (share - 0.5) * 8
+    # Shift and number of bits of each of three numbers in a word.
+    eleven, ten, eight = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10)), ((24, 8), (16, 8), (8, 8))
+    return coding.scene_of(
+        between(_unpack(position, eleven), _BOUNDS[:6]),
+        between(_unpack(scale, eleven), _BOUNDS[6:12]),
+        coding.from_smallest_three((rotation >> 30).astype(np.int64), (_unpack(rotation, ten) - 0.5) * 2**0.5),
+        coding.logits_of_bytes(color & 255),
+        (between(_unpack(color, eight), _BOUNDS[12:]) - 0.5) / SH_C0,
         coefficients,
     )
 

@@ -9,11 +9,8 @@ from typing import Any
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 
-GAUSSIANS = "KHR_gaussian_splatting"
-TILE_EXTENSIONS = (GAUSSIANS, "KHR_gaussian_splatting_compression_spz_2")
+TILE_EXTENSIONS = ("KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2")
 """What a program must know to draw tiles."""
-
-_FLOAT, _BYTE = 5126, 5121  # glTF's numbers
 
 
 def encode_tile(scene: Gaussians) -> bytes:
@@ -22,21 +19,21 @@ def encode_tile(scene: Gaussians) -> bytes:
     The scene has z up, as tiles have. Its node turns it to y up, as glTF has, and moves it to its offset. The axes in
     the SPZ are the scene's.
     """
-    packed = encode_spz(scene.replace(offset=None))
+    packed, (prefix, packing) = encode_spz(scene.replace(offset=None)), TILE_EXTENSIONS
     bands = [f"SH_DEGREE_{d}_COEF_{index}" for d in range(1, scene.sh_degree + 1) for index in range(2 * d + 1)]
-    names = ["POSITION", "COLOR_0", *(f"{GAUSSIANS}:{name}" for name in ("SCALE", "ROTATION", *bands))]
-    shapes = {"COLOR_0": "VEC4", f"{GAUSSIANS}:ROTATION": "VEC4"}
+    names = ["POSITION", "COLOR_0", *(f"{prefix}:{name}" for name in ("SCALE", "ROTATION", *bands))]
+    shapes = {"COLOR_0": "VEC4", f"{prefix}:ROTATION": "VEC4"}
     accessors: list[dict[str, Any]] = [
-        {"componentType": _FLOAT, "count": len(scene), "type": shapes.get(name, "VEC3")} for name in names
+        {"componentType": 5126, "count": len(scene), "type": shapes.get(name, "VEC3")} for name in names
     ]
-    accessors[1].update(componentType=_BYTE, normalized=True)
+    accessors[1].update(componentType=5121, normalized=True)  # bytes; the others are float32
     low, high = scene.means.aminmax(dim=0)
     accessors[0].update(min=low.tolist(), max=high.tolist())
     x, y, z = scene.offset or (0.0, 0.0, 0.0)
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},
         "mode": 0,
-        "extensions": {GAUSSIANS: {"extensions": {TILE_EXTENSIONS[1]: {"bufferView": 0}}}},
+        "extensions": {prefix: {"extensions": {packing: {"bufferView": 0}}}},
     }
     content = {
         "asset": {"version": "2.0", "generator": "pointsplat-ns"},

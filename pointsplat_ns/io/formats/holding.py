@@ -19,9 +19,6 @@ from pointsplat_ns.io.formats.rounding import weights
 from pointsplat_ns.io.offsets import offset_text
 from pointsplat_ns.system.tensors import DOUBLES
 
-_REPORTED = 0.01
-"""Share of the Gaussians that lose something, by number or by weight in pictures, above which a loss is reported."""
-
 _DARKEST = (-0.44 - 0.5) / SH_C0
 """Constant SH coefficient that black need not fall below."""
 
@@ -66,7 +63,7 @@ class Holds:
 
 def losses(scene: Gaussians, holds: Holds) -> list[str]:
     """What a scene, float32 on the CPU, loses in a format: a clause with numbers for each attribute, none where the
-    format holds it."""
+    format holds it, or at most 1 % of the Gaussians lose something, by their weight in pictures."""
     found = []
     if scene.antialiased and not holds.antialiased:
         found.append("the mark of antialiased training")
@@ -95,7 +92,7 @@ def losses(scene: Gaussians, holds: Holds) -> list[str]:
         found.append(f"SH of degree {scene.sh_degree} are left out, so colours no longer change with the view")
     error = _colour_errors(scene, fitted, holds)
     share = _share(error > 0.2, scene)
-    if share > _REPORTED:
+    if share > 0.01:
         found.append(
             f"{_percent(share)} of the Gaussians have colours outside of its range, by {float(error.max()):.2g} of "
             "white at most"
@@ -197,7 +194,7 @@ def _colour_errors(scene: Gaussians, fitted: Gaussians, holds: Holds) -> Tensor:
 
 
 def _cut(mask: Tensor, scene: Gaussians, than: str, limit: float, drawn: str) -> list[str]:
-    if _weight(mask, scene) <= _REPORTED:
+    if _weight(mask, scene) <= 0.01:
         return []
     count = _percent(float(mask.double().mean()))
     return [f"{count} of the Gaussians are {than} than {math.exp(limit):.2g} units and become {drawn}"]

@@ -12,9 +12,6 @@ from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 LEVELS = 256
 """Entries of a codebook of numbers."""
 
-_SAMPLE = 1 << 17
-"""Numbers that a codebook is made from, and rows that the first split of a palette is made from."""
-
 
 def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     """256 numbers that stand for finite float32 values of any shape, by Lloyd's algorithm (k-means in one dimension):
@@ -24,7 +21,8 @@ def codebook(values: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros(LEVELS, **FLOATS), torch.zeros(values.shape, dtype=torch.uint8, device="cpu")
     book = _distinct(flat)
     if book is None:
-        ordered = torch.cat([flat[:: -(-flat.numel() // _SAMPLE)], flat.amin()[None], flat.amax()[None]])
+        stride = -(-flat.numel() // (1 << 17))  # a sample is enough
+        ordered = torch.cat([flat[::stride], flat.amin()[None], flat.amax()[None]])
         book = _spread(ordered)
         for _ in range(20):
             index = _nearest(book, ordered)
@@ -59,35 +57,25 @@ def _nearest(book: Tensor, values: Tensor) -> Tensor:
     return torch.bucketize(values, (book[1:] + book[:-1]) / 2)
 
 
-def palette_size(count: int) -> int:
-    """Entries of the palette for so many Gaussians: a power of two, at most what an index reaches."""
-    size = 1024  # Gaussians per entry where there are few
-    while 2 * size <= min(count, 65_536):  # an index has 16 bits
-        size *= 2
-    return size
-
-
-def palette(
-    rows: Tensor, progress: Callable[[float], None], size: int | None = None, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def palette(rows: Tensor, size: int, weights: Tensor, progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
     """Rows that stand for finite float32 rows (N, D), by k-means in levels: rows are split into clusters, each gets a
     part of the palette, as large as its squared error, and is split in turn. That takes a small part of the time of
     k-means with as many clusters at once. If there are no more different rows than entries, they are the palette.
 
     Args:
         rows: finite float32 rows (N, D).
+        size: entries, a multiple of 64.
+        weights: how much the squared error of each row counts (N,), above 0.
         progress: called with the share done.
-        size: entries, a multiple of 64, by default :func:`palette_size`.
-        weights: how much the squared error of each row counts (N,), above 0; None for 1.
 
     Returns:
         The palette (P, D), P a multiple of 64, and the index (N,) of the entry for each row.
     """
-    n, size = len(rows), size or palette_size(len(rows))
+    n = len(rows)
     branches, deepest = 64, 6  # clusters that rows are split into, and how often
     if (found := _different(rows, size)) is not None:
         return found
-    weights = torch.ones(n, **FLOATS) if weights is None else weights.float()
+    weights = weights.float()
     generator = torch.Generator().manual_seed(0)  # the same input gives the same bits
     book, index = rows.new_zeros(size, rows.shape[1]), torch.empty(n, **INDICES)
     waiting = [(torch.arange(n, **INDICES), size, 0)]
@@ -97,7 +85,7 @@ def palette(
         part, weight = rows[members], weights[members]
         at_once = k <= branches or k * len(part) <= 1 << 22  # for fewer, splits take longer and err more
         if not at_once and depth < deepest:
-            sample = torch.randperm(len(part), generator=generator, device="cpu")[:_SAMPLE]
+            sample = torch.randperm(len(part), generator=generator, device="cpu")[: 1 << 17]
             centres = _means(part[sample], weight[sample], branches, generator)
             of = _assign(part, centres)
             counts = torch.bincount(of, minlength=branches)

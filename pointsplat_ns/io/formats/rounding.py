@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,38 +52,21 @@ class RoundingSettings:
 ROUNDING = RoundingSettings()
 
 
-@dataclass(frozen=True)
-class Rounding:
-    """How far the numbers of a scene are rounded."""
-
-    tolerance: float
-    """Error of the colour of a Gaussian of usual weight, as a share of the colour range; 0 for no rounding."""
-
-    def finer(self, steps: float) -> Rounding:
-        """So many steps finer, each with half of the squared error; coarser where ``steps`` is negative."""
-        return Rounding(self.tolerance * 2 ** (-0.5 * steps))
-
-
-def rounding_for(psnr: float, sh_degree: int) -> Rounding:
-    """The rounding of a scene of some PSNR, dB, and SH degree."""
+def rounding_for(psnr: float, sh_degree: int) -> float:
+    """The rounding of a scene of some PSNR, dB, and SH degree: its tolerance, the error of the colour of a Gaussian of
+    usual weight, as a share of the colour range."""
     share = ROUNDING.share if sh_degree else ROUNDING.share_without_sh
-    return Rounding(share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20))
+    return share * 10 ** (-min(psnr, ROUNDING.best_psnr) / 20)
 
 
-_UNIFORM = math.sqrt(12)  # steps of rounding for a root mean squared error of 1
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
+class Steps(NamedTuple):
     """The largest steps that the numbers of N Gaussians may be rounded to, each (N, 1) float64."""
 
     sh: Tensor
     alphas: Tensor
     log_scales: Tensor
-    means: Tensor
-    """World units."""
-    quats: Tensor
-    """Of quaternions of length 1."""
+    means: Tensor  # world units
+    quats: Tensor  # of quaternions of length 1
 
 
 def weights(scene: Gaussians) -> Tensor:
@@ -95,12 +79,13 @@ def weights(scene: Gaussians) -> Tensor:
 def steps_of(scene: Gaussians, tolerance: float) -> Steps:
     """The steps of N usable Gaussians on the CPU, for a tolerance of a Gaussian of usual weight."""
     each = (tolerance * weights(scene).rsqrt())[:, None]
-    shape = _UNIFORM * each / ROUNDING.contrast
+    uniform = math.sqrt(12)  # steps of rounding for a root mean squared error of 1
+    shape = uniform * each / ROUNDING.contrast
     logs = scene.scales.double().sort(dim=1).values
     ratio = (logs[:, 2:] - logs[:, :1]).clamp(max=-math.log(ROUNDING.thinnest))
     smallest = (logs[:, 2:] - ratio).exp()
     return Steps(
-        sh=_UNIFORM * each / SH_C0,
+        sh=uniform * each / SH_C0,
         alphas=shape * scene.alphas.double().reshape(-1, 1),
         log_scales=shape / math.sqrt(0.75),
         means=shape * math.sqrt(2) * smallest,
@@ -108,12 +93,12 @@ def steps_of(scene: Gaussians, tolerance: float) -> Steps:
     )
 
 
-def rounded(scene: Gaussians, rounding: Rounding) -> Gaussians:
+def rounded(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene of N usable Gaussians, float32 on the CPU, of which every number is a multiple of the largest power of
-    two that its step allows."""
-    if not rounding.tolerance or not len(scene):
+    two that its step allows, for a tolerance above 0 of a Gaussian of usual weight."""
+    if not len(scene):
         return scene
-    steps = steps_of(scene, rounding.tolerance)
+    steps = steps_of(scene, tolerance)
     return rounded_shapes(scene, steps).replace(
         means=multiples(scene.means.double(), steps.means).float(),
         features_rest=multiples(scene.features_rest.double(), steps.sh[:, None]).float(),

@@ -23,23 +23,12 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.io.formats.coding import (
-    Array,
-    bytes_of_logits,
-    damage_named,
-    from_smallest_three,
-    logits_of_bytes,
-    morton_order,
-    require_plausible,
-    scene_of,
-    smallest_three,
-    to_bytes,
-    unit_quats,
-)
+from pointsplat_ns.io.formats import coding
+from pointsplat_ns.io.formats.coding import Array
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.io.formats.palette import LEVELS, codebook, palette
-from pointsplat_ns.io.formats.rounding import ROUNDING, Rounding, multiples, rounded_shapes, steps_of, weights
-from pointsplat_ns.io.formats.sog_images import META, Images, webp
+from pointsplat_ns.io.formats.rounding import ROUNDING, multiples, rounded_shapes, steps_of, weights
+from pointsplat_ns.io.formats.sog_images import SOG_META, Images, webp
 from pointsplat_ns.system.progress import Progress, silent
 
 MAX_SIDE = 16_383
@@ -47,8 +36,6 @@ MAX_SIDE = 16_383
 
 _LEVELS = 65_535  # of positions, steps
 _ACROSS = 64  # palette entries in one row of pixels
-_MOST_ENTRIES = 65_536  # of a palette
-_LARGEST = 252  # alpha of a quaternion's pixel is this plus the index of its largest component
 
 
 def read_sog(path: Path | str) -> Gaussians:
@@ -56,7 +43,7 @@ def read_sog(path: Path | str) -> Gaussians:
     has no number, as :func:`~pointsplat_ns.io.read_scene` does. Raises SceneError if a part is missing or damaged, or
     declares more than it can hold."""
     path = Path(path)
-    with damage_named(path, "SOG"), closing(Images(path)) as images:
+    with coding.damage_named(path, "SOG"), closing(Images(path)) as images:
         return _decode(images, images.meta(), path)
 
 
@@ -78,21 +65,21 @@ def _decode(images: Images, meta: dict[str, Any], path: Path) -> Gaussians:
     n = meta["count"] if version == 2 else meta["means"]["shape"][0]
     if not isinstance(n, int) or not 0 <= n <= MAX_SIDE**2:
         raise SceneError(f"{path}: declares {n!r} Gaussians; expected a number up to {MAX_SIDE**2}")
-    require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
+    coding.require_plausible(path, 16 * n, images.size, n, _rest_of(meta))  # four images that every scene has
     pixels = functools.partial(_pixels, images, n)
     low, high = pixels(meta["means"], 0), pixels(meta["means"], 1)
     mins, maxs = (_numbers(meta["means"][name], 3) for name in ("mins", "maxs"))
     logs = mins + (maxs - mins) * (low[:, :3].astype(np.float64) + 256.0 * high[:, :3]) / _LEVELS
     quats, colors = pixels(meta["quats"]), pixels(meta["sh0"])
-    tops = quats[:, 3].astype(np.int64) - _LARGEST
-    rotations = from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
+    tops = quats[:, 3].astype(np.int64) - 252  # alpha is this plus the index of the largest component
+    rotations = coding.from_smallest_three(tops.clip(0), (quats[:, :3].astype(np.float64) / 255 - 0.5) * 2**0.5)
     rotations[tops < 0] = (1, 0, 0, 0)  # as the viewers of this format do
     dc = _looked_up(meta["sh0"], colors, 3 if version == 2 else 4)
-    return scene_of(
-        np.sign(logs) * np.expm1(np.abs(logs)),
+    return coding.scene_of(
+        _of_logs(logs),
         _looked_up(meta["scales"], pixels(meta["scales"]), 3),
         rotations,
-        logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
+        coding.logits_of_bytes(colors[:, 3]) if version == 2 else dc[:, 3],
         dc[:, :3],
         _read_sh(images, n, meta),
     ).replace(antialiased=meta.get("model") == "antialiased")
@@ -164,18 +151,18 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     if max(width, height) > MAX_SIDE:
         raise SceneError(f"{n} Gaussians; a SOG file holds at most {MAX_SIDE**2}")
     progress("packing attributes", 0.0)
-    scene = scene if ordered else scene[morton_order(scene)]
+    scene = scene if ordered else scene[coding.morton_order(scene)]
     images: dict[str, tuple[Array, int, int]] = {}
 
     def add(name: str, columns: Sequence[Array]) -> list[str]:
         images[name] = (np.column_stack(columns).astype(np.uint8), width, height)
         return [name]
 
-    levels, mins, maxs = _levels_of(scene)
+    levels, mins, maxs, _ = _levels_of(scene)
     steps = np.rint(levels).astype(np.int64)
     scales, scale_index = codebook(scene.scales.clamp_min(HOLDS.sizes.low))  # as of flat axes
     colors, color_index = codebook(scene.features_dc)
-    largest, others = smallest_three(unit_quats(scene))
+    largest, others = coding.smallest_three(coding.unit_quats(scene))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "pointsplat-ns"},
@@ -186,10 +173,10 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
             "files": add("means_l.webp", [steps & 255]) + add("means_u.webp", [steps >> 8]),
         },
         "scales": {"codebook": _short(scales), "files": add("scales.webp", [scale_index.numpy()])},
-        "quats": {"files": add("quats.webp", [to_bytes((others / 2**0.5 + 0.5) * 255), _LARGEST + largest])},
+        "quats": {"files": add("quats.webp", [coding.to_bytes((others / 2**0.5 + 0.5) * 255), 252 + largest])},
         "sh0": {
             "codebook": _short(colors),
-            "files": add("sh0.webp", [color_index.numpy(), bytes_of_logits(scene)]),
+            "files": add("sh0.webp", [color_index.numpy(), coding.bytes_of_logits(scene)]),
         },
     }
     if scene.antialiased:
@@ -200,7 +187,7 @@ def sog_parts(scene: Gaussians, progress: Progress, ordered: bool = False) -> di
     for done, (name, image) in enumerate(images.items()):
         progress("compressing", done / len(images))
         files[name] = webp(*image)
-    return {META: json.dumps(meta).encode(), **files}
+    return {SOG_META: json.dumps(meta).encode(), **files}
 
 
 def _short(book: Tensor) -> list[float]:
@@ -210,37 +197,36 @@ def _short(book: Tensor) -> list[float]:
     return [float(f"{value:.9g}") for value in book[: last + 1].tolist()] + [0] * (len(book) - last - 1)
 
 
-def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array]:
-    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, and the logarithms that are these two, (3,) each."""
+def _of_logs(logs: Array) -> Array:
+    """Positions of their logarithms."""
+    return np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _levels_of(scene: Gaussians) -> tuple[Array, Array, Array, Tensor]:
+    """Positions as logarithms, (N, 3) float64 from 0 to 65,535, the logarithms that are these two, (3,) each, and the
+    steps of positions there, (N, 3) float64, world units."""
     means = scene.means.double().numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
     mins, maxs = (logs.min(axis=0), logs.max(axis=0)) if len(means) else (np.zeros(3), np.zeros(3))
-    return (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _LEVELS, mins, maxs
+    levels = (logs - mins) / np.where(maxs > mins, maxs - mins, 1.0) * _LEVELS
+    return levels, mins, maxs, torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())
 
 
-def _position_steps(scene: Gaussians) -> Tensor:
-    """Along the axis with the coarsest levels, (N,)."""
-    _, mins, maxs = _levels_of(scene)
-    return (torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())).amax(dim=1)
+HOLDS = Holds(sizes=Span(-30.0), position_steps=lambda scene: _levels_of(scene)[3].amax(dim=1))
 
 
-HOLDS = Holds(sizes=Span(-30.0), position_steps=_position_steps)
-
-
-def rounded_for_sog(scene: Gaussians, rounding: Rounding) -> Gaussians:
+def rounded_for_sog(scene: Gaussians, tolerance: float) -> Gaussians:
     """A scene that takes fewer bytes as SOG: its numbers are rounded (:mod:`~pointsplat_ns.io.formats.rounding`), and
-    its SH above degree 0 are entries of a palette. Arguments as of
-    :func:`~pointsplat_ns.io.formats.rounding.rounded`."""
-    if not rounding.tolerance or not len(scene):
+    its SH above degree 0 are entries of a palette. A tolerance of 0 leaves it."""
+    if not tolerance or not len(scene):
         return scene
-    steps = steps_of(scene, rounding.tolerance)
-    levels, mins, maxs = _levels_of(scene)
-    of_level = torch.from_numpy((maxs - mins) / _LEVELS) * (1 + scene.means.double().abs())  # world units
+    steps = steps_of(scene, tolerance)
+    levels, mins, maxs, of_level = _levels_of(scene)
     coarse = multiples(torch.from_numpy(levels), (steps.means / of_level.clamp_min(1e-300)).clamp_min(1)).numpy()
     outermost = (levels <= 0) | (levels >= _LEVELS)  # they stay, so that levels keep their meaning
     logs = mins + (maxs - mins) * np.where(outermost, levels, coarse.clip(0, _LEVELS)) / _LEVELS
-    means = torch.from_numpy(np.sign(logs) * np.expm1(np.abs(logs))).float()
-    rest = _few_sh(scene, rounding.tolerance) if scene.sh_degree else scene.features_rest
+    means = torch.from_numpy(_of_logs(logs)).float()
+    rest = _few_sh(scene, tolerance) if scene.sh_degree else scene.features_rest
     return rounded_shapes(scene, steps).replace(means=means, features_rest=rest)
 
 
@@ -249,11 +235,11 @@ def _few_sh(scene: Gaussians, tolerance: float) -> Tensor:
     one entry for two Gaussians. Its numbers are multiples of their error."""
     rows, each = scene.features_rest.flatten(1), weights(scene)
     wanted = ROUNDING.palette_error * tolerance / (SH_C0 * scene.features_rest.shape[1] ** 0.5)
-    most = min(len(scene) // 2, _MOST_ENTRIES)
+    most = min(len(scene) // 2, 65_536)
 
     def made(share: float) -> tuple[Tensor, Tensor, float]:
         """A palette of a number of entries, the index of each Gaussian's, and the error of a coefficient."""
-        book, index = palette(rows, lambda done: None, 64 * max(int(share / 64), 1), each)
+        book, index = palette(rows, 64 * max(int(share / 64), 1), each, lambda done: None)
         return book, index, float((each @ (book[index] - rows).double().square().mean(dim=1) / each.sum()).sqrt())
 
     size = len(scene) / ROUNDING.most_rows
@@ -274,7 +260,8 @@ def _pack_sh(
     """Add the palette and its indices to ``images``; returns what ``meta.json`` says of them."""
     rest = scene.features_rest.shape[1]
     report = functools.partial(progress, "making the SH palette")
-    rows, index = palette(scene.features_rest.flatten(1), report, weights=weights(scene))
+    entries = max(1024, 1 << min(len(scene), 65_536).bit_length() >> 1)  # a power of two; an index has 16 bits
+    rows, index = palette(scene.features_rest.flatten(1), entries, weights(scene), report)
     levels, level_index = codebook(rows)
     labels = np.column_stack([index.numpy() & 255, index.numpy() >> 8, np.zeros(len(index))])
     images["shN_centroids.webp"] = (level_index.reshape(-1, 3).numpy(), _ACROSS * rest, len(rows) // _ACROSS)

@@ -14,25 +14,21 @@ from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.files import require_file, require_memory
 from pointsplat_ns.io.formats.coding import Array
 
-META = "meta.json"
+SOG_META = "meta.json"
 
 
 class Images:
-    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one; others are a SceneError."""
+    """The parts of one SOG file: a zip archive, a folder, or the ``meta.json`` in one. Errors are as
+    :func:`~pointsplat_ns.io.formats.coding.damage_named` has them, and SceneErrors."""
 
     def __init__(self, path: Path):
         self.path = path
         self._zip: zipfile.ZipFile | None = None
-        folder = path if path.is_dir() else path.parent
-        if path.is_dir() or path.name == META:
-            self._folder = folder
-            require_file(folder / META, f"{META} of a SOG folder")
+        self._folder = path if path.is_dir() else path.parent
+        if path.is_dir() or path.name == SOG_META:
+            require_file(self._folder / SOG_META, f"{SOG_META} of a SOG folder")
         else:
-            require_file(path, "a .sog file")
-            try:
-                self._zip = zipfile.ZipFile(path)
-            except (zipfile.BadZipFile, NotImplementedError) as error:
-                raise SceneError(f"{path}: not a .sog file, or truncated ({error}); expected a zip archive") from error
+            self._zip = zipfile.ZipFile(require_file(path, "a .sog file"))
 
     def close(self) -> None:
         """Close the archive."""
@@ -48,9 +44,9 @@ class Images:
 
     def meta(self) -> dict[str, Any]:
         """The content of ``meta.json``."""
-        content = json.loads(self._bytes(META, 1 << 22))  # one has about 20 kB
+        content = json.loads(self._bytes(SOG_META, 1 << 22))  # one has about 20 kB
         if not isinstance(content, dict):
-            raise SceneError(f"{self.path}: {META} holds a {type(content).__name__}; expected an object")
+            raise SceneError(f"{self.path}: {SOG_META} holds a {type(content).__name__}; expected an object")
         return content
 
     def pixels(self, name: Any, least: int, width: int | None = None) -> Array:
@@ -67,7 +63,7 @@ class Images:
         from PIL import Image
 
         if not isinstance(name, str) or PurePosixPath(name).name != name or "\\" in name:
-            raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {META}")
+            raise SceneError(f"{self.path}: an image called {name!r}; expected the name of a file beside {SOG_META}")
         most = 6 * least + (1 << 16)  # version 1 leaves open which of 3, 8 and 15 SH; some programs round sides up
         data = self._bytes(name, 4 * most)
         across, down = webp_size(data)  # opening an image takes the memory of its pixels already
@@ -93,13 +89,8 @@ class Images:
             size = entries[0].file_size
         if size > most:
             raise SceneError(f"{self.path}: {name} has {size} bytes; expected at most {most}")
-        if self._zip is None:
-            return part.read_bytes()
-        try:
-            with self._zip.open(entries[0]) as stream:
-                return stream.read(most + 1)  # the size in the archive may be a lie
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
-            raise SceneError(f"{self.path}: damaged; {name} cannot be read ({error})") from error
+        with part.open("rb") if self._zip is None else self._zip.open(entries[0]) as stream:
+            return stream.read(most + 1)  # the size in the archive may be a lie
 
 
 def webp_size(data: bytes) -> tuple[int, int]:

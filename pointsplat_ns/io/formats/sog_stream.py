@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -24,7 +24,7 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.files import read_text, replacing, require_file, require_memory
 from pointsplat_ns.io.formats.coding import damage_named, joined
 from pointsplat_ns.io.formats.sog import read_sog, sog_parts
-from pointsplat_ns.io.formats.sog_images import META
+from pointsplat_ns.io.formats.sog_images import SOG_META
 from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -46,7 +46,7 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
 
     Args:
         path: ``lod-meta.json``, or the folder of it.
-        level: 0 is the finest; -1 the coarsest.
+        level: 0 is the finest.
 
     Raises:
         SceneError: if there is no such level, a file is missing, damaged or lies outside the folder, or has another
@@ -58,22 +58,18 @@ def read_sog_stream(path: Path | str, level: int = 0) -> Gaussians:
     with damage_named(path, "streamed SOG"):
         meta = _meta(path)
         levels = meta["lodLevels"]
-        if not -levels <= level < levels:
+        if not 0 <= level < levels:
             raise SceneError(f"{path}: no level {level}; it has {levels}, 0 is the finest")
-        names, counts = meta["filenames"], _counts(meta["tree"], level % levels, meta["filenames"])
+        counts = _counts(meta["tree"], level, meta["filenames"])
         require_memory(path, 4 * 14 * sum(counts.values()))
-        files: list[tuple[Path, int | None]] = [
-            (_beside(path, names[index]), counts[index]) for index in sorted(counts)
-        ]
-        environment = meta.get("environment")
-        if environment is not None:
-            files.append((_beside(path, environment), None))
+        files = {_beside(path, meta["filenames"][index]): counts[index] for index in sorted(counts)}
+        around = [] if meta.get("environment") is None else [_beside(path, meta["environment"])]
     parts = []
-    for file, count in files:
+    for file, count in files.items():
         parts.append(read_sog(file))
-        if count not in (None, len(parts[-1])):
+        if count != len(parts[-1]):
             raise SceneError(f"{file}: {len(parts[-1])} Gaussians; {STREAM_META} names {count} of level {level}")
-    return joined(parts)
+    return joined([*parts, *map(read_sog, around)])
 
 
 def coarser_levels(path: Path, finest: int) -> list[Gaussians]:
@@ -101,7 +97,7 @@ def stream_parts(path: Path) -> list[Path]:
         names = [name for name in (*meta["filenames"], meta.get("environment")) if name is not None]
         found = [path]
         for file in (_beside(path, name) for name in names):
-            found += [file] if file.name != META else sorted(file.parent.glob("*.webp")) + [file]
+            found += [file] if file.name != SOG_META else sorted(file.parent.glob("*.webp")) + [file]
         return found
 
 
@@ -125,22 +121,19 @@ def write_sog_stream(
     Raises:
         SceneError: if a file cannot be written.
     """
+    files: list[tuple[int, list[Tensor]]] = []  # the level of each, and its rows
+    last: dict[int, int] = {}  # of each level, its last file
     names: list[str] = []
-    open_file = [(-1, 0)] * len(levels)  # of each level: index in names, Gaussians in it
-    rows: dict[int, list[Tensor]] = {}  # of each file
-    level_of: list[int] = []
-    counts = [0] * len(levels)
 
     def entry(level: int, members: Tensor) -> dict[str, int]:
-        file, held = open_file[level]
+        file = last.get(level, -1)
+        held = sum(map(len, files[file][1])) if file >= 0 else 0
         if file < 0 or held > chunk:
-            file, held = len(names), 0
-            names.append(f"{level}_{level_of.count(level)}/{META}")
-            level_of.append(level)
-            rows[file] = []
-        rows[file].append(members)
-        open_file[level] = (file, held + len(members))
-        counts[level] += len(members)
+            file, held = len(files), 0
+            names.append(f"{level}_{sum(level == other for other, _ in files)}/{SOG_META}")
+            files.append((level, []))
+            last[level] = file
+        files[file][1].append(members)
         return {"file": file, "offset": held, "count": len(members)}
 
     def node(part: Node) -> dict[str, Any]:
@@ -150,12 +143,11 @@ def write_sog_stream(
             bound = {"min": [min(axis) for axis in zip(*lows, strict=True)]}
             return {"bound": bound | {"max": [max(axis) for axis in zip(*highs, strict=True)]}, "children": children}
         lods = {str(level): entry(level, members) for level, members in enumerate(part.rows) if len(members)}
-        return {
-            "bound": _bound([scene[members] for scene, members in zip(levels, part.rows, strict=True)]),
-            "lods": lods,
-        }
+        bound = _bound([scene[members] for scene, members in zip(levels, part.rows, strict=True)])
+        return {"bound": bound, "lods": lods}
 
     described = node(tree)
+    counts = [sum(len(part) for at, parts in files if at == level for part in parts) for level in range(len(levels))]
     meta = {
         "version": 1,
         "asset": {"generator": "pointsplat-ns"},
@@ -169,33 +161,30 @@ def write_sog_stream(
     with ExitStack() as stack:
         # Left in the opposite order: lod-meta.json comes last.
         stack.enter_context(replacing(path)).write_text(json.dumps(meta, separators=(",", ":")), "utf-8")
-        for file, name in enumerate(names):
-            scene = levels[level_of[file]][torch.cat(rows[file])]
-            folder = path.parent / name.partition("/")[0]
-            parts = sog_parts(scene, _part_of(progress, file, len(names)), ordered=True)
-            for part, data in sorted(parts.items(), key=lambda item: item[0] != META):
-                stack.enter_context(replacing(folder / part, len(data))).write_bytes(data)
+        for file, (name, (level, rows)) in enumerate(zip(names, files, strict=True)):
+
+            def report(what: str, share: float, done: int = file) -> None:
+                progress(f"file {done + 1} of {len(names)}", (done + share) / len(names))
+
+            parts = sog_parts(levels[level][torch.cat(rows)], report, ordered=True)
+            for part, data in sorted(parts.items(), key=lambda item: item[0] != SOG_META):
+                part_path = (path.parent / name).with_name(part)
+                stack.enter_context(replacing(part_path, len(data))).write_bytes(data)
         path.unlink(missing_ok=True)
     return meta
 
 
-def _part_of(progress: Progress, index: int, count: int) -> Callable[[str, float], None]:
-    return lambda what, share: progress(f"file {index + 1} of {count}", (index + share) / count)
-
-
 def _bound(parts: Sequence[Gaussians]) -> dict[str, list[float]]:
-    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other programs write it."""
+    """The box of the boxes of all Gaussians, of one standard deviation along their axes, as other programs write it, in
+    the digits that float32 has."""
     scene = joined(parts, 0)
     half = (rotation_matrices(scene.quats).abs() @ scene.stds[..., None])[..., 0]
-    low, high = (scene.means - half).amin(dim=0), (scene.means + half).amax(dim=0)
     limit = torch.finfo(torch.float32).max
-    corners = {"min": low, "max": high}
-    return {name: _with_seven_digits(corner.nan_to_num(0.0, limit, -limit)) for name, corner in corners.items()}
-
-
-def _with_seven_digits(values: Tensor) -> list[float]:
-    """Numbers with the digits that float32 has."""
-    return [float(f"{value:.7g}") for value in values.tolist()]
+    corners = {"min": (scene.means - half).amin(dim=0), "max": (scene.means + half).amax(dim=0)}
+    return {
+        name: [float(f"{value:.7g}") for value in corner.nan_to_num(0.0, limit, -limit).tolist()]
+        for name, corner in corners.items()
+    }
 
 
 def _meta(path: Path) -> dict[str, Any]:
@@ -216,8 +205,8 @@ def _beside(path: Path, name: Any) -> Path:
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or set("\\:") & set(name):
         raise SceneError(f"{path}: names the file {name!r}; expected one in its own folder")
-    if parts[-1] != META and not name.lower().endswith(".sog"):
-        raise SceneError(f"{path}: names the file {name!r}; expected a {META} or a .sog")
+    if parts[-1] != SOG_META and not name.lower().endswith(".sog"):
+        raise SceneError(f"{path}: names the file {name!r}; expected a {SOG_META} or a .sog")
     return path.parent.joinpath(*parts)
 
 

@@ -9,24 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from pointsplat_ns.errors import SceneError
-from pointsplat_ns.gaussians import PLAIN, Gaussians, Traits
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import require_file, require_memory
-from pointsplat_ns.io.formats.coding import (
-    bytes_of_logits,
-    damage_named,
-    dc_of_shares,
-    finite_sizes,
-    log_of_sizes,
-    logits_of_bytes,
-    scene_of,
-    shares_of_dc,
-    to_bytes,
-    unit_quats,
-)
+from pointsplat_ns.io.formats import coding
 from pointsplat_ns.io.formats.holding import Holds, Span
 from pointsplat_ns.system.progress import Progress, silent
 
@@ -41,29 +31,22 @@ def read_splat(path: Path | str) -> Gaussians:
     path = require_file(path, "a .splat file")
     size = path.stat().st_size
     if size % _ROW.itemsize:
-        raise SceneError(
-            f"{path}: {size} bytes, not a multiple of {_ROW.itemsize}; expected {_ROW.itemsize} bytes a Gaussian"
-        )
+        raise SceneError(f"{path}: {size} bytes; expected {_ROW.itemsize} bytes a Gaussian")
     with path.open("rb") as stream:
         start = stream.read(4096)
     if start and start.isascii() and start.decode().replace("\n", "").replace("\r", "").replace("\t", "").isprintable():
         raise SceneError(f"{path}: text ({start[:24]!r}...); expected the rows of a .splat file")
     require_memory(path, size + size // _ROW.itemsize * 4 * 14)
-    with damage_named(path, ".splat"):
+    with coding.damage_named(path, ".splat"):
         rows = np.fromfile(path, _ROW)
-        return scene_of(
+        return coding.scene_of(
             rows["means"],
-            log_of_sizes(rows["stds"]),
+            np.log(rows["stds"]),  # of zero -Inf, a flat axis; of a negative size NaN, which is dropped
             (rows["quats"].astype(np.float32) - 128) / 128,
-            logits_of_bytes(rows["rgba"][:, 3]),
-            dc_of_shares(rows["rgba"][:, :3].astype(np.float32) / 255),
+            coding.logits_of_bytes(rows["rgba"][:, 3]),
+            (rows["rgba"][:, :3].astype(np.float32) / 255 - 0.5) / SH_C0,
             np.empty((len(rows), 0, 3)),
         )
-
-
-def splat_bytes(count: int, sh_degree: int, traits: Traits = PLAIN) -> int:
-    """Size of a ``.splat`` file of ``count`` Gaussians, bytes."""
-    return _ROW.itemsize * count
 
 
 def drawing_order(scene: Gaussians) -> Tensor:
@@ -80,8 +63,9 @@ def encode_splat(scene: Gaussians, progress: Progress = silent) -> bytes:
     scene = scene[drawing_order(scene)]
     rows = np.empty(len(scene), _ROW)
     rows["means"] = scene.means.numpy()
-    rows["stds"] = finite_sizes(scene)
-    rows["rgba"][:, :3] = to_bytes(255 * shares_of_dc(scene))
-    rows["rgba"][:, 3] = bytes_of_logits(scene)
-    rows["quats"] = to_bytes(128 * unit_quats(scene) + 128)
+    # Readers drop infinite sizes.
+    rows["stds"] = scene.stds.clamp_max(torch.finfo(torch.float32).max).numpy()
+    rows["rgba"][:, :3] = coding.to_bytes(255 * coding.shares_of_dc(scene))
+    rows["rgba"][:, 3] = coding.bytes_of_logits(scene)
+    rows["quats"] = coding.to_bytes(128 * coding.unit_quats(scene) + 128)
     return rows.tobytes()

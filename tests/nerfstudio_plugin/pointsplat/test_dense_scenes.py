@@ -10,7 +10,7 @@ from making import box_room
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io import write_ply
-from pointsplat_ns.io.discovery import find_plys
+from pointsplat_ns.io.discovery import find_runs_and_plys
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
@@ -48,7 +48,7 @@ def test_a_folder_of_ply_files_is_scenes_learned_from_their_own_renders(rooms):
     manager = manager_of(rooms)
     assert [scene.name for scene in manager.scenes] == ["deep-iteration_7-point_cloud", "one"]
     assert manager.supervision == "dense" and not any(scene.has_photos for scene in manager.scenes)
-    assert [name for name, _ in find_plys(rooms / "one.ply")] == ["one"]
+    assert [*find_runs_and_plys(rooms / "one.ply", "auto")[1]] == ["one"]
     assert [scene.name for scene in manager_of(rooms / "one.ply").scenes] == ["one"]
 
 
