@@ -29,7 +29,6 @@ def prune(
     plot: Path | None = None,
     dry_run: bool = False,
     force: options.Force = False,
-    jobs: options.Jobs = None,
     memory: options.Megabytes | None = None,
     threads: options.Threads = None,
     verbose: options.Verbose = False,
@@ -58,8 +57,7 @@ def prune(
         plot: a .png file for a plot of the distributions of opacity and volume, before and after; by default none.
         dry_run: compute and print everything, but write no scene.
         memory: how much memory may be taken, such as 8GB; by default what is free. A PLY that needs more is merged in
-            parts, with files beside the output; a command that was killed resumes. With --jobs each process may
-            take so much.
+            parts, with files beside the output; a command that was killed resumes.
     """
     options.need_scenes(scene)
     import pointsplat_ns as ps
@@ -87,8 +85,6 @@ def prune(
     small: ps.Gaussians | PlyRows | None
     with fixed_threads(threads):
         if rows is None:
-            if jobs is not None:
-                raise ps.SceneError(f"{scene}: fits into memory; --jobs is for a scene that is merged in parts")
             looking = Looking(poses, resolution, up, data, photos)
             dense, pruned, seconds, source = prune_source(scene, request, looking, progress=True)
             small, before = pruned, len(dense)
@@ -100,11 +96,9 @@ def prune(
         elif dry_run or plot is not None or photos is not False:
             raise ps.SceneError(f"{scene}: does not fit into memory; expected no --dry-run, --plot or --photos")
         else:
-            processes, size = 1 if jobs is None else jobs, parse_resolution(resolution)
+            size = parse_resolution(resolution)
             with progress_bar() as report:
-                before, seconds = prune_file(
-                    rows, output, request, limit, poses, size, up_named(up), report, jobs=processes
-                )
+                before, seconds = prune_file(rows, output, request, limit, poses, size, up_named(up), report)
             small, quality = PlyRows.open(output), None
     assert small is not None
     if json_output:

@@ -25,7 +25,6 @@ from pointsplat_ns.merging.settings import MERGING
 from pointsplat_ns.photos.posed_scene import PosesFile, without_poses
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.workers import check_jobs
 from pointsplat_ns.views import Views
 
 
@@ -100,7 +99,6 @@ def prune_file(
     resolution: tuple[int, int] | None = None,
     up: Up | None = None,
     progress: Progress = silent,
-    jobs: int = 1,
 ) -> tuple[int, float]:
     """Merge a PLY cell by cell. A call that was killed resumes where it was, from a hidden folder beside the output.
 
@@ -113,7 +111,6 @@ def prune_file(
         resolution: width and height of views, pixels.
         up: which way is up, for sampled views; by default what the scene declares, or estimated.
         progress: called with what is being done, and the share done of it.
-        jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:
         The number of Gaussians before, those that cannot be drawn left out, and seconds.
@@ -122,10 +119,9 @@ def prune_file(
         PointSplatError: if the memory is too small.
         SceneError: if a file cannot be read or written, or the disk has no room for what lies between.
         BudgetError: if the budget does not fit the scene.
-        DataError: if the cameras are not usable, or the number of jobs is not valid.
+        DataError: if the cameras are not usable.
     """
     start = time.perf_counter()
-    check_jobs(jobs)
     if output.suffix.lower() != ".ply":
         raise SceneError(
             f"{output}: is written as a whole; expected a .ply for a scene larger than memory, which "
@@ -162,7 +158,7 @@ def prune_file(
     size = rows.count * (_row_bytes(rows) + 150) + count * _row_bytes(rows)  # 150 bytes for each between rounds
     scratch = Scratch(output.with_name(f".{output.name}.cells"), work, size)
     sampler = functools.partial(Sampler, resolution=resolution or RESOLUTION, up=up)
-    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress, jobs=jobs)
+    before, _ = merge_file(rows, count_of, output, most, scratch, views, sampler, progress)
     scratch.remove()
     return before, time.perf_counter() - start
 

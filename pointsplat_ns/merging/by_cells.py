@@ -6,8 +6,7 @@
    exact.
 4. In each cell, members are regrouped, and their rows are written.
 
-What a step has written is kept, and a command that was killed resumes from there. Several processes may share the
-cells. Files hold all that passes between them.
+What a step has written is kept, and a command that was killed resumes from there.
 """
 
 from __future__ import annotations
@@ -15,10 +14,9 @@ from __future__ import annotations
 import functools
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,26 +31,16 @@ from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
-from pointsplat_ns.merging.matching import candidate_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import (
-    OF_EACH,
-    ColourAxes,
-    Participants,
-    State,
-    drawable,
-    initial_state,
-    principal_axes,
-)
+from pointsplat_ns.merging.state import OF_EACH, Participants, State, drawable, initial_state, principal_axes
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
-from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.views import Views
 
 
@@ -67,7 +55,6 @@ def merge_file(
     sampler: Callable[[Gaussians], Sampler] = Sampler,
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
-    jobs: int = 1,
 ) -> tuple[int, int]:
     """Merge the Gaussians of a file, and write those that remain, cell by cell.
 
@@ -81,7 +68,6 @@ def merge_file(
         sampler: from Gaussians of the scene to the sampler of their views.
         progress: called with what is being done, and the share done of it.
         settings: the tuned numbers.
-        jobs: number of processes that share the cells. The result is the same to the bit.
 
     Returns:
         The numbers of Gaussians before and after.
@@ -89,7 +75,6 @@ def merge_file(
     Raises:
         SceneError: if a file cannot be read or written, or no Gaussian can be drawn.
         BudgetError: that ``count_of`` raises, or if there are more cells than Gaussians that remain.
-        PointSplatError: if processes are killed.
     """
     cells = divided(rows, most, scratch, functools.partial(progress, "dividing into cells"))
     k = count_of(cells.count)
@@ -103,29 +88,31 @@ def merge_file(
         with one_thread_each():
             return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
 
+    def each(what: str) -> Iterator[int]:
+        """Every cell, with progress."""
+        for cell in range(len(cells)):
+            progress(what, cell / len(cells))
+            yield cell
+        progress(what, 1.0)
+
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
-    with Workers(work, jobs) as workers:
-
-        def each(what: str, step: Callable[..., None], *args: object) -> None:
-            """Take a step of every cell."""
-            progress(what, 0.0)
-            steps = [(step, cell, *args) for cell in range(len(cells))]
-            for done, _ in enumerate(workers.results(steps), 1):
-                progress(what, done / len(cells))
-
-        rounds, left = 0, -1
-        while left != k:
-            chosen = _chosen(rounds)
-            if not scratch.has(chosen):
-                each(f"merging, round {rounds + 1}", _Work.find, rounds)
-            left = int(scratch.tensors(chosen, functools.partial(work.choose, rounds))["left"])
-            rounds += 1
-        changes = [scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))]
-        each("finishing", _Work.finish, rounds, float(torch.cat(changes).mean()))
+    rounds, left = 0, -1
+    while left != k:
+        if not scratch.has(_chosen(rounds)):
+            for cell in each(f"merging, round {rounds + 1}"):
+                scratch.make(_round(rounds, cell), functools.partial(work.pairs, rounds, cell))
+                scratch.drop(_round(rounds - 2, cell))
+        left = int(scratch.tensors(_chosen(rounds), functools.partial(work.choose, rounds))["left"])
+        rounds += 1
+    changes = torch.cat([scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))])
+    parts = [
+        scratch.file(f"finished_{cell:04d}.rows", functools.partial(work.write, rounds, cell, float(changes.mean())))
+        for cell in each("finishing")
+    ]
     with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
         stream.write(header_bytes(k, rows.sh_degree, rows.traits))
-        for cell in range(len(cells)):
-            with (scratch.folder / _finished(cell)).open("rb") as finished:
+        for rows_of_cell in parts:
+            with rows_of_cell.open("rb") as finished:
                 shutil.copyfileobj(finished, stream, 1 << 20)
     return cells.count, k
 
@@ -138,12 +125,8 @@ class Overview:
     size: Tensor  # scalar float64, diagonal of the content, scene units
     keys: Tensor  # [m] int64, ascending places on the curve
     weights: Tensor  # [m] float32, visibility weights there
-    middle: Tensor  # [3 (d+1)^2] of the axes of colours
+    middle: Tensor  # [3 (d+1)^2] as of principal_axes
     axes: Tensor  # [3 (d+1)^2, C]
-
-    def weights_at(self, keys: Tensor) -> Tensor:
-        """Visibility weights (n,) at places (n,) on the curve."""
-        return self.weights[torch.searchsorted(self.keys, keys).clamp_max_(len(self.keys) - 1)]
 
 
 def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -> Overview:
@@ -160,7 +143,7 @@ def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """The steps, whose results are kept. Called with one of its functions and their arguments, in any process."""
+    """The steps of cells."""
 
     cells: Cells
     overview: Overview
@@ -168,19 +151,16 @@ class _Work:
     sampler: Callable[[Gaussians], Sampler]
     settings: MergeSettings
 
-    def __call__(self, step: tuple[Any, ...]) -> None:
-        function, *args = step
-        function(self, *args)
-
-    def find(self, cell: int, number: int) -> None:
-        """Find the pairs of a cell that may be merged in a round."""
-        scratch = self.cells.scratch
-        scratch.make(_round(number, cell), functools.partial(self._round, number, cell))
-        scratch.drop(_round(number - 2, cell))
-
-    def finish(self, cell: int, rounds: int, size_change: float) -> None:
-        """Write the rows of a cell after so many rounds."""
-        self.cells.scratch.file(_finished(cell), functools.partial(self._write, rounds, cell, size_change))
+    def pairs(self, number: int, cell: int) -> dict[str, Tensor]:
+        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it, and the pairs that
+        may be merged next."""
+        with one_thread_each():
+            state, group = self.state(number, cell)
+            near = other_neighbours(state.means.double(), self.settings.neighbours)
+            costs = pair_costs(state, near, self.settings)
+            first, second, prices = cheapest_pairs(near, costs, self.settings.matching_passes)
+        pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
+        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
 
     def choose(self, number: int) -> dict[str, Tensor]:
         """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
@@ -197,44 +177,32 @@ class _Work:
         parts = chosen.split([len(part) for part in prices])
         return {**{f"{cell}": part for cell, part in enumerate(parts)}, "left": left - chosen.sum()}
 
-    def _round(self, number: int, cell: int) -> dict[str, Tensor]:
-        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it, and the pairs that
-        may be merged next."""
-        with one_thread_each():
-            state, group = self._state(number, cell)
-            near = other_neighbours(state.means.double(), self.settings.neighbours)
-            costs = pair_costs(state, near, self.settings)
-            first, second, prices = candidate_pairs(near, costs, self.settings.matching_passes)
-        pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
-        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
-
-    def _state(self, number: int, cell: int) -> tuple[State, Tensor]:
+    def state(self, number: int, cell: int) -> tuple[State, Tensor]:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
+        scratch, overview = self.cells.scratch, self.overview
         if number == 0:
-            state = self._first_state(cell)
+            participants = self.participants(cell)
+            scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
+            places = self.cells.keys_of(participants.scene)[participants.members]
+            nearest = torch.searchsorted(overview.keys, places).clamp_max_(len(overview.keys) - 1)
+            state = initial_state(participants, overview.weights[nearest], (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
-        scratch = self.cells.scratch
         before = scratch.known(_round(number - 1, cell))
         of_each = {name: before[name] for name in OF_EACH}
-        state = State(**of_each, centre=self.overview.centre, size=float(self.overview.size))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))
+        state = State(**of_each, centre=overview.centre, size=float(overview.size))
         after, merged = replace_pairs(state, first, second, self.settings)
         return after, merged.place[before["group"]].long()
 
-    def _first_state(self, cell: int) -> State:
-        participants = self._participants(cell)
-        self.cells.scratch.tensors(_sizes(cell), functools.partial(self._size_changes, cell, participants))
-        weights = self.overview.weights_at(self.cells.keys_of(participants.scene)[participants.members])
-        return initial_state(participants, weights, ColourAxes(self.overview.middle, self.overview.axes))
-
-    def _participants(self, cell: int) -> Participants:
+    def participants(self, cell: int) -> Participants:
+        """The participants of a cell, along the curve."""
         scene = self.cells.read(cell)
         members = drawable(scene, -(-len(scene) * self.k // self.cells.count))
         order = self.cells.keys_of(scene)[members].argsort(stable=True)
         return Participants(scene, members[order], self.overview.centre, float(self.overview.size))
 
-    def _size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
+    def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """The finish of the parts in this cell, of four parts that are evenly spread over all cells.
 
         In five scenes, an eighth of a scene at a time, their mean factor differs from that of the whole by 0.02 at
@@ -251,12 +219,12 @@ class _Work:
                 changes.append(merged.finish.size_change)
         return {"changes": torch.tensor(changes, **FLOATS)}
 
-    def _write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
-        """Regroup the members of a cell, and write the rows of its groups."""
+    def write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
+        """Regroup the members of a cell after so many rounds, and write the rows of its groups."""
         with one_thread_each():
-            state, group = self._state(rounds, cell)
-            participants = self._participants(cell)
-            groups = Groups.of(participants, state, [Round(group, torch.ones(len(group), **FLOATS))])
+            state, group = self.state(rounds, cell)
+            participants = self.participants(cell)
+            groups = Groups.of(state, [Round(group, torch.ones(len(group), **FLOATS))])
             del state
             if groups.any_merged:
                 groups = regrouped(participants, groups, self.settings)
@@ -269,10 +237,6 @@ def _round(number: int, cell: int) -> str:
 
 def _chosen(number: int) -> str:
     return f"chosen_{number}"
-
-
-def _finished(cell: int) -> str:
-    return f"finished_{cell:04d}.rows"
 
 
 def _sizes(cell: int) -> str:

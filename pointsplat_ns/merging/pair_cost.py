@@ -21,7 +21,7 @@ W_i is the visibility weight of i. c_0 = 0.01 and b = 0.3 are contrasts that are
 the far background; c_min and d are ``min_cover`` and ``background_decay`` of the settings.
 
 The replacement has the common mass, centre and covariance, as in
-:mod:`~pointsplat_ns.merging.replacement`, with areas in the plane. All integrals are sums of overlaps, which
+:mod:`~pointsplat_ns.merging.pairs`, with areas in the plane. All integrals are sums of overlaps, which
 have a closed form:
 
     <G_p, G_q> = integral of G_p G_q = A_p A_q / A_pq * exp(-d_pq^2 / 2),   <G_p, G_p> = A_p / 2
@@ -42,7 +42,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.merging.covariance import plane_axes
-from pointsplat_ns.merging.replacement import growth
+from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
@@ -107,7 +107,7 @@ def pair_costs(
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
     # the largest numbers of neighbours and of colour axes that the kernel is made for
-    fits = near.shape[1] <= 32 and state.colours.shape[1] <= 16 and near.dtype == torch.int32
+    fits = near.shape[1] <= 8 and state.colours.shape[1] <= 8 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
     costs = torch.empty(near.shape, dtype=dtype, device="cpu")

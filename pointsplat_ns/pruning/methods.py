@@ -11,7 +11,6 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
 from pointsplat_ns.pruning.baselines import authors_score, opacity_score, random_score
@@ -128,9 +127,7 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
     need_usable(scene)
     if method.score is None:
-        merged = merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None)
-        logger.debug("%s", merged.finish.note)
-        return merged.scene
+        return merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None).scene
     given = None if isinstance(views, Sampler) else views
     return scene[select(score_of(scene, method, given, opacity_weight, progress), count)]
 

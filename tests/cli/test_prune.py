@@ -15,6 +15,7 @@ from making import ball, normal_scene, run_of, same
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.io import read_ply, read_scene, write_ply
 from pointsplat_ns.looking.sampling import sample_views
+from pointsplat_ns.merging import cells
 from pointsplat_ns.pruning import METHODS, prune
 from posing import inria, written
 
@@ -114,15 +115,32 @@ def test_a_scene_that_fits_is_said_to_fit_and_a_lossy_file_to_differ(tmp_path, c
     assert re.search(r"(?m)^(more than )?[\d.]+ dB, SSIM \d.\d\d: ", said) and "inf" not in said
 
 
-def test_a_scene_that_does_not_fit_is_merged_in_parts(tmp_path, capsys, monkeypatch):
+def test_a_scene_that_does_not_fit_is_merged_in_parts_and_resumed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(prune_file, "MEMORY", prune_file.MemorySettings(base=0, least=100))
     scene, small = tmp_path / "scene.ply", tmp_path / "small.ply"
     write_ply(normal_scene(900, degree=1, seed=SEED), scene)
-    run("prune", scene, "--keep", "10%", "--sh", "0", "--memory", "200kB", "-o", small, "--json")
+    words = ("prune", scene, "--keep", "10%", "--sh", "0", "--memory", "200kB", "-o")
+    run(*words, small, "--json")
     said = json.loads(capsys.readouterr().out)
     assert (said["gaussians_before"], said["gaussians"], said["sh_degree"]) == (900, 90, 0)
     assert len(read_ply(small)) == 90
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.ply", "small.ply"]
+    steps, write = [], cells.write_tensors
+
+    def interrupted(path, *rest):
+        if len(steps) == 6:
+            raise KeyboardInterrupt
+        steps.append(path.name)
+        write(path, *rest)
+
+    with monkeypatch.context() as patch, pytest.raises((SystemExit, KeyboardInterrupt)):
+        patch.setattr(cells, "write_tensors", interrupted)
+        run(*words, tmp_path / "resumed.ply")
+    assert len(list((tmp_path / ".resumed.ply.cells").glob("*.safetensors"))) == 6
+    monkeypatch.setattr(cells, "write_tensors", lambda path, *rest: (steps.append(path.name), write(path, *rest)))
+    run(*words, tmp_path / "resumed.ply")
+    assert (tmp_path / "resumed.ply").read_bytes() == small.read_bytes() and len(steps) == len(set(steps))
+    capsys.readouterr()
     run("prune", scene, "--keep", "10%", "--memory", "8GB", "-o", tmp_path / "whole.ply")
     assert "not compared" not in capsys.readouterr().out
 

@@ -113,13 +113,13 @@ def extremes(n: int) -> Gaussians:
 @compiled_or_not
 def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
     """Each Gaussian with the next ones."""
-    state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(30)) % 200
+    state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(8)) % 200
     costs = pair_costs(state, others.to(torch.int32), compiled=compiled)
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())
 
 
 @needs_compiler
-@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3), (9, 3), (30, 8)])
+@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3)])
 def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
     """Gaussians of a splat's proportions, some of them opaque, so that replacements grow. A cost is the difference of
     larger numbers, so the error of either is a share of the larger ones of a Gaussian's costs."""

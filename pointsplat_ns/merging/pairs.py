@@ -1,4 +1,6 @@
-"""What a pair becomes: one Gaussian of the pair's common mass, centre, covariance and colour.
+"""The pairs of a round: which go, and what they become, one Gaussian of common mass, centre, covariance and colour.
+
+Each pass over the Gaussians still free takes the pairs that are the cheapest for both of their members.
 
 With the mass ``m = a A`` of opacity a and root mean square area A, and the shares ``w_i = m_i / (m_i + m_j)``,
 ``w_j = 1 - w_i``, a pair (i, j) becomes k with
@@ -14,6 +16,7 @@ both members cover and the replacement covers once. Where a_k is above the large
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,9 +33,71 @@ from pointsplat_ns.merging.covariance import (
     rms_area,
     thinnest_axes,
 )
-from pointsplat_ns.merging.settings import MergeSettings
+from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import OF_EACH, State
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
+
+NEVER = torch.iinfo(torch.int64).max
+"""Key of a pair that cannot be."""
+
+
+def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_passes) -> tuple[Tensor, Tensor, Tensor]:
+    """Disjoint pairs of neighbours, the cheapest first.
+
+    Ties are broken by hashed numbers: broken by the numbers themselves, a row of equal Gaussians would yield one pair a
+    pass.
+
+    Args:
+        near: (n, k) int32, indices of the neighbours of each Gaussian; its own index means none.
+        costs: (n, k) float32, at least 0, of merging each with each neighbour. Where two are neighbours of each other,
+            the mean of their two costs counts.
+        passes: number of passes.
+
+    Returns:
+        First and second members, (E,) int64 each, and costs, (E,) float32; at least one pair if there is any neighbour.
+    """
+    n, keys = len(near), _keys(near, costs)
+    rows, others, found = torch.arange(n, **INDICES), near.T.long().contiguous(), []
+    for _ in range(passes):
+        least, slot = keys.min(0)
+        best = torch.full((n,), NEVER, **INDICES)
+        best[rows] = least
+        best.scatter_reduce_(0, others.flatten(), keys.flatten(), "amin")
+        partner = others.gather(0, slot[None])[0]
+        mutual = (least == best[rows]) & (least == best[partner]) & (least < NEVER)
+        i, j = rows[mutual], partner[mutual]
+        found.append((i, j, least[mutual]))
+        taken = torch.zeros(n, **FLAGS)
+        taken[i] = taken[j] = True
+        keys.masked_fill_(taken[rows] | taken.index_select(0, others.flatten()).view(others.shape), NEVER)
+        left = (keys.amin(0) < NEVER).nonzero()[:, 0]
+        if len(i) == 0 or len(left) == 0:
+            break
+        rows, others, keys = rows[left], others.index_select(1, left), keys.index_select(1, left)
+    first, second, key = (torch.cat(parts) for parts in zip(*found, strict=True))
+    prices, order = (key >> 32).int().view(torch.float32).sort(stable=True)
+    return first[order], second[order], prices
+
+
+def _keys(near: Tensor, costs: Tensor) -> Tensor:
+    """Numbers (k, n) int64 of pairs, each pair in the row of its smaller index if both are neighbours of each other.
+    They are ordered as the costs, whose bits are the upper half: the bits of a float32 that is not negative are ordered
+    as the float is. The lower half makes them all different."""
+    n, k = near.shape
+    keys = torch.empty(k, n, **INDICES)
+    for rows in torch.arange(n, **INDICES).split(1 << 14):  # these fit into a cache
+        here = slice(int(rows[0]), int(rows[-1]) + 1)
+        own, others, me = costs[here], near[here].long(), rows[:, None]
+        back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
+        theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
+        slot = back.to(torch.uint8).argmax(2, keepdim=True)
+        mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
+        once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
+        # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
+        hashed = ((me * k + torch.arange(k, **INDICES)) * 2654435761) & 0xFFFFFFFF
+        key = (once.view(torch.int32).long() << 32) | hashed
+        keys[:, here] = key.where(once < math.inf, NEVER).T
+    return keys
 
 
 class Round(NamedTuple):
