@@ -13,9 +13,8 @@ from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneE
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
-from pointsplat_ns.pruning.baselines import authors_score, opacity_score, random_score
+from pointsplat_ns.pruning.baselines import authors_score, coverage_score, opacity_score, random_score
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
-from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.paper import paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.views import Views
@@ -99,7 +98,7 @@ def prune(
     scene: Gaussians,
     keep: Keep | str,
     by: str = "merge",
-    views: Views | Sampler | Callable[[], Views] | None = None,
+    views: Views | Sampler | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
@@ -109,8 +108,7 @@ def prune(
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them, or a function that returns them. Merging uses views or a sampler; for
-            a function or None it samples views of its own.
+        views: views for methods that need them. Merging uses views or a sampler; for None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
 
@@ -127,7 +125,7 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
     need_usable(scene)
     if method.score is None:
-        return merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None).scene
+        return merge(scene, count, progress, views).scene
     given = None if isinstance(views, Sampler) else views
     return scene[select(score_of(scene, method, given, opacity_weight, progress), count)]
 
@@ -140,7 +138,8 @@ def score_of(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:
-    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`."""
+    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`, and ``views`` may be
+    a function that returns them."""
     assert method.score is not None, f"{method.name} has no score"
     if method.needs_views:
         if views is None:

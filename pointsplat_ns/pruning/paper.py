@@ -37,7 +37,7 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
     """
-    return weighted_score(scene, opacity_weight, opacity, _relative_volume)
+    return weighted_score(scene, opacity_weight, lambda part: part.opacities[:, 0].double().sigmoid(), _relative_volume)
 
 
 def weighted_score(
@@ -64,11 +64,6 @@ def zscore(values: Tensor) -> Tensor:
         return torch.zeros_like(values)
     centred = values - values.mean()
     return centred / centred.square().mean().sqrt()
-
-
-def opacity(scene: Gaussians) -> Tensor:
-    """The paper's alpha, in [0, 1], (N,) float64."""
-    return torch.sigmoid(scene.opacities[:, 0].double())
 
 
 def log_volume(scene: Gaussians) -> Tensor:

@@ -85,19 +85,13 @@ class Refiner(nn.Module):
                 f"structure of {structure.total} Gaussians and settings {structure.built_for} given for "
                 f"{len(scene)} Gaussians and settings {structure_key(self.config)}; call prepare(scene) again"
             )
-        if structure.usable is None:
-            return self._refine(scene, structure)
-        return _put_back(self._refine(scene[structure.usable], structure), structure.usable, scene)
-
-    def _refine(self, scene: Gaussians, structure: Structure) -> Gaussians:
-        """The refined scene of usable Gaussians."""
-        features = gaussian_features(
-            scene, structure.cube, self.config.num_rest, self.dtype, raw=self.config.raw_inputs
-        )
-        refined = _moved(scene, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
-        if self.training or (sound := refined.usable()).all():
-            return refined
-        return _put_back(refined[sound], sound, scene)
+        some = scene if structure.usable is None else scene[structure.usable]
+        raw = self.config.raw_inputs
+        features = gaussian_features(some, structure.cube, self.config.num_rest, self.dtype, raw)
+        refined = _moved(some, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
+        if not self.training and not (sound := refined.usable()).all():
+            refined = _put_back(refined[sound], sound, some)
+        return refined if structure.usable is None else _put_back(refined, structure.usable, scene)
 
     def residuals(self, features: Features, structure: Structure) -> dict[str, Tensor]:
         """Residuals by attribute, in the network's units and the scene's order. # {name: [N, size]}"""
@@ -149,7 +143,7 @@ def gaussian_features(
     """
     # -5 is a typical log-scale in the unit cube: 4 cm in a room of 6 m
     centre, spread, logit_spread = (0.0, 1.0, 1.0) if raw else (-5.0, 2.0, 4.0)
-    log_scales = (cube.log_scales(scene.scales) - centre) / spread
+    log_scales = (scene.scales.double() - cube.extent.log() - centre) / spread
     low, high = ((bound - centre) / spread for bound in (-17.0, 7.0))
     logits = scene.opacities.clamp(-12.0, 12.0) / logit_spread  # beyond 12, opacity is 0 or 1 within 1e-5
     sh_limit = 8.0  # displayable colours need at most 1.8

@@ -35,10 +35,6 @@ class UnitCube:
         """Positions in [-0.5, 0.5], float64; those outside the cube are clamped to it. # [N, 3]"""
         return ((means.double() - self.centre) / self.extent).clamp(-0.5, 0.5)
 
-    def log_scales(self, scales: Tensor) -> Tensor:
-        """Log-scales in units of the cube, in float64. # [N, 3]"""
-        return scales.double() - self.extent.log()
-
 
 def unit_cube(means: Tensor) -> UnitCube:
     """The unit cube of at least one finite position (N, 3), scene units.
@@ -135,7 +131,7 @@ class Structure:
     order: Tensor  # [N] scene index of the point at each place in memory
     inverse: Tensor  # [N] place in memory of each Gaussian of the scene
     levels: list[GridLevel]
-    built_for: tuple  # :func:`structure_key` of its configuration
+    built_for: tuple  # the settings that it depends on, :func:`structure_key` of its configuration
     usable: Tensor | None = None  # [T] mask of the N Gaussians in the structure; None: all
 
     @property
