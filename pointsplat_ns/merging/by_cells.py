@@ -15,7 +15,7 @@ import functools
 import math
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -36,7 +36,7 @@ from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import OF_EACH, Participants, State, drawable, initial_state, principal_axes
+from pointsplat_ns.merging.state import Participants, State, drawable, initial_state, principal_axes
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
@@ -104,15 +104,16 @@ def merge_file(
                 scratch.drop(_round(rounds - 2, cell))
         left = int(scratch.tensors(_chosen(rounds), functools.partial(work.choose, rounds))["left"])
         rounds += 1
-    changes = torch.cat([scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))])
-    parts = [
-        scratch.file(f"finished_{cell:04d}.rows", functools.partial(work.write, rounds, cell, float(changes.mean())))
-        for cell in each("finishing")
-    ]
+    changes = torch.cat([scratch.known(f"sizes_{cell:04d}")["changes"] for cell in range(len(cells))])
+    parts = [scratch.folder / f"finished_{cell:04d}.rows" for cell in range(len(cells))]
+    for cell in each("finishing"):
+        if not parts[cell].is_file():
+            with replacing(parts[cell]) as part:
+                work.write(rounds, cell, float(changes.mean()), part)
     with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
         stream.write(header_bytes(k, rows.sh_degree, rows.traits))
-        for rows_of_cell in parts:
-            with rows_of_cell.open("rb") as finished:
+        for path in parts:
+            with path.open("rb") as finished:
                 shutil.copyfileobj(finished, stream, 1 << 20)
     return cells.count, k
 
@@ -160,7 +161,7 @@ class _Work:
             costs = pair_costs(state, near, self.settings)
             first, second, prices = cheapest_pairs(near, costs, self.settings.matching_passes)
         pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
-        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
+        return {**vars(state), "group": group.int(), **pairs}
 
     def choose(self, number: int) -> dict[str, Tensor]:
         """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
@@ -182,17 +183,16 @@ class _Work:
         scratch, overview = self.cells.scratch, self.overview
         if number == 0:
             participants = self.participants(cell)
-            scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
+            scratch.make(f"sizes_{cell:04d}", functools.partial(self.size_changes, cell, participants))
             places = self.cells.keys_of(participants.scene)[participants.members]
             nearest = torch.searchsorted(overview.keys, places).clamp_max_(len(overview.keys) - 1)
             state = initial_state(participants, overview.weights[nearest], (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
         before = scratch.known(_round(number - 1, cell))
-        of_each = {name: before[name] for name in OF_EACH}
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))
-        state = State(**of_each, centre=overview.centre, size=float(overview.size))
-        after, merged = replace_pairs(state, first, second, self.settings)
+        earlier = State(**{field.name: before[field.name] for field in fields(State)})
+        after, merged = replace_pairs(earlier, first, second, self.settings)
         return after, merged.place[before["group"]].long()
 
     def participants(self, cell: int) -> Participants:
@@ -215,8 +215,7 @@ class _Work:
                 start = max(0, int(place * len(participants)) - size // 2)
                 part = participants.scene[participants.members[start : start + size]]
                 few = max(1, len(part) * self.k // self.cells.count)
-                merged = merge(part, few, views=self.sampler(part), settings=self.settings)
-                changes.append(merged.finish.size_change)
+                changes.append(merge(part, few, views=self.sampler(part), settings=self.settings).size_change)
         return {"changes": torch.tensor(changes, **FLOATS)}
 
     def write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
@@ -224,7 +223,7 @@ class _Work:
         with one_thread_each():
             state, group = self.state(rounds, cell)
             participants = self.participants(cell)
-            groups = Groups.of(state, [Round(group, torch.ones(len(group), **FLOATS))])
+            groups = Groups.of(participants, state, [Round(group, torch.ones(len(group), **FLOATS))])
             del state
             if groups.any_merged:
                 groups = regrouped(participants, groups, self.settings)
@@ -237,7 +236,3 @@ def _round(number: int, cell: int) -> str:
 
 def _chosen(number: int) -> str:
     return f"chosen_{number}"
-
-
-def _sizes(cell: int) -> str:
-    return f"sizes_{cell:04d}"

@@ -35,13 +35,14 @@ class Groups:
     counts: Tensor  # [K] int32, number of members
 
     @classmethod
-    def of(cls, state: State, rounds: Sequence[Round]) -> Groups:
+    def of(cls, participants: Participants, state: State, rounds: Sequence[Round]) -> Groups:
         """The groups that became the Gaussians of a state after some rounds."""
         group, shares = torch.arange(len(state), **INDICES), torch.ones(len(state), **FLOATS)
         for place, share in reversed(rounds):
             group, shares = group[place], shares[place] * share
-        means = state.means.double() * state.size + state.centre
-        return cls(group, shares, means, state.cov.double() * state.size**2, state.alphas.double(), state.counts)
+        means = state.means.double() * participants.size + participants.centre
+        cov = state.cov.double() * participants.size**2
+        return cls(group, shares, means, cov, state.alphas.double(), state.counts)
 
     @property
     def any_merged(self) -> bool:
@@ -123,27 +124,14 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     return scales, quats
 
 
-@dataclass(frozen=True)
-class Finish:
-    """The change of the sizes of merged Gaussians."""
-
-    size_change: float = 0.0
-    """Added to the log-scales of merged Gaussians."""
-    psnr: float | None = None
-    """PSNR against the dense scene's renders, dB; None if nothing was rendered."""
-    psnr_before: float | None = None
-    """The same with a size change of 0, dB."""
-
-
-def best_finish(psnr_of: Callable[[float], float]) -> Finish:
+def best_size_change(psnr_of: Callable[[float], float]) -> float:
     """The best size change of those tried: three, and the top of the parabola through them, a little outside of them at
     most. ``psnr_of`` gives the PSNR of the scene with a size change, dB."""
     changes = (-0.1, 0.0, 0.05)
     tried = {change: psnr_of(change) for change in changes}
     top = top_of_parabola(changes, list(tried.values()), margin=0.05)
     tried[top] = psnr_of(top)
-    best = max(tried, key=lambda change: tried[change])
-    return Finish(best, psnr=tried[best], psnr_before=tried[0.0])
+    return max(tried, key=lambda change: tried[change])
 
 
 def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:

@@ -17,7 +17,6 @@ both members cover and the replacement covers once. Where a_k is above the large
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -34,7 +33,7 @@ from pointsplat_ns.merging.covariance import (
     thinnest_axes,
 )
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import OF_EACH, State
+from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
 
 NEVER = torch.iinfo(torch.int64).max
@@ -123,7 +122,7 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     place = stays.cumsum(0) - 1
     place[second] = place[first]
     rows = stays.nonzero()[:, 0]
-    after = replace(state, **{name: getattr(state, name).index_select(0, rows) for name in OF_EACH})
+    after = State(**{name: values.index_select(0, rows) for name, values in vars(state).items()})
     shares = torch.ones(len(state), **FLOATS)
     for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
         i, j = first[part], second[part]

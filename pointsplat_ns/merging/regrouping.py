@@ -8,8 +8,7 @@ hard EM of a mixture of Gaussians whose data are Gaussians (Vasconcelos and Lipp
     fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2 contrast^2)
 
 The less, the better: the expected negative log-density of the group over the member, and the difference of colour. The
-mass of a member, by which the moments of a group are weighted, is opacity times root mean square area. A compiled
-kernel (``regrouping.cpp``) compares groups, or torch.
+mass of a member, by which the moments of a group are weighted, is opacity times root mean square area.
 """
 
 from __future__ import annotations

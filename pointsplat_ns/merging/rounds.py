@@ -1,11 +1,8 @@
 """The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
 
 Everything is computed on one thread each, in pieces that several threads take: the result is the same bits on any
-number of threads, and no thread waits for another within an operation.
-
-Memory: besides the scene itself at most 0.35 kB a Gaussian. Freed blocks of other sizes would come on top of it, and
-are given back to the system before steps that take much. SH coefficients are read twice, in pieces: for the principal
-axes of colours, and at the end for the means of members.
+number of threads, and no thread waits for another within an operation. Besides the scene itself, at most 0.35 kB a
+Gaussian are taken; freed blocks are given back to the system before steps that take much.
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.merging.groups import Finish, Groups, best_finish, scene_maker
+from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
 from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
@@ -43,8 +40,8 @@ class Merged:
     scene: Gaussians
     """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
-    finish: Finish
-    """The numbers chosen for this scene."""
+    size_change: float = 0.0
+    """Added to the log-scales of merged Gaussians, chosen by renders."""
 
 
 def merge(
@@ -56,7 +53,7 @@ def merge(
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn are dropped first. The others are merged in pairs, cheapest first.
+    Gaussians too faint to be drawn are dropped first.
 
     Args:
         scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
@@ -120,12 +117,7 @@ class Merger:
         scene, views, settings: as for :func:`merge`.
     """
 
-    def __init__(
-        self,
-        scene: Gaussians,
-        views: Views | Sampler | None = None,
-        settings: MergeSettings = MERGING,
-    ):
+    def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
         self._scene, self._options = scene, (views, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
@@ -160,7 +152,7 @@ def _levels(
     n = len(scene)
     if n in counts:
         report(0.0 if len(counts) > 1 else 1.0)
-        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64), Finish())
+        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64))
         counts = counts[1:]
     if not counts:
         return
@@ -195,7 +187,7 @@ class Step:
 
     def groups(self) -> Groups:
         """The participants in groups, one for each Gaussian that remains."""
-        return Groups.of(self.state, self.rounds)
+        return Groups.of(self.participants, self.state, self.rounds)
 
 
 def first_step(
@@ -256,7 +248,7 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
     """The result after some rounds, on a device."""
     participants, reference = step.participants, step.reference
     with one_thread_each():
-        groups, finish = step.groups(), Finish()
+        groups, size_change = step.groups(), 0.0
         any_merged = groups.any_merged
         if regroup and any_merged and settings.regrouping_rounds > 0:
             groups = regrouped(participants, groups, settings)
@@ -265,8 +257,8 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
         del groups
         if reference is not None and any_merged:
             unit = participants.centre, participants.size
-            finish = best_finish(lambda change: reference.psnr(in_units(make(change), *unit)))
-        scene = make(finish.size_change)
+            size_change = best_size_change(lambda change: reference.psnr(in_units(make(change), *unit)))
+        scene = make(size_change)
     assignment = torch.full((len(participants.scene),), -1, **INDICES)
     assignment[participants.members] = group
-    return Merged(scene.to(device), assignment.to(device), finish)
+    return Merged(scene.to(device), assignment.to(device), size_change)

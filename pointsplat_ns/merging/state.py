@@ -58,10 +58,6 @@ def drawable(scene: Gaussians, k: int) -> Tensor:
     return chosen.nonzero()[:, 0]
 
 
-OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
-"""Tensors of a state that have a row for each Gaussian."""
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """The Gaussians that remain after some rounds.
@@ -75,9 +71,6 @@ class State:
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
     counts: Tensor  # [n] int32, number of Gaussians that each stands for
-    centre: Tensor  # [3] float64, of the scene
-    size: float
-    """Diagonal of the scene's content, scene units."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -109,8 +102,6 @@ def initial_state(
         ),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
-        centre=centre,
-        size=size,
     )
 
 

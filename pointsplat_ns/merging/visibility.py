@@ -1,14 +1,10 @@
 """Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors count by it.
 
-The error that counts is per solid angle, not per squared metre, and only where something is seen. So both distance and
-occlusion matter, and a render measures both: a Gaussian covers the sum over pixels of its blend weight, alpha times
-transmittance. Divided by its opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
+A Gaussian covers the sum over pixels of its blend weight, alpha times transmittance. Divided by its opacity and area,
+that is large near the cameras, small far away, and 0 behind a wall.
 
 Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
 size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
-
-Where traces in the scene show where its photos were taken, the weight is multiplied by the trace factor
-(:mod:`~pointsplat_ns.looking.traces`).
 """
 
 from __future__ import annotations
@@ -49,7 +45,8 @@ def views_and_weights(
         report: called with the share done.
 
     Returns:
-        No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
+        No views for a small scene without known ones, if nothing is visible, or if no view is asked for. Where traces
+        show where the scene's photos were taken, weights are multiplied by :mod:`~pointsplat_ns.looking.traces`.
     """
     found, photos_found = (views if isinstance(views, Views) else None), False
     if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:

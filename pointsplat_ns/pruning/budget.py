@@ -76,8 +76,7 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
-    Gaussian. A ratio gives the nearest count (a half is rounded up), and at least one. A count above ``n`` keeps all.
-    A size gives as many Gaussians as fit into the file.
+    Gaussian. A ratio gives the nearest count, and at least one. A size gives as many as fit into the file.
 
     Args:
         n: number of Gaussians in the scene.
@@ -88,14 +87,12 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
         The count, in 1..n.
 
     Raises:
-        BudgetError: if ``keep`` is out of range, NaN or not a number, if it can only be resolved by rendering
-            (:class:`WithinPsnr`) or by writing (the size of a compressed file), or if the scene is empty.
+        BudgetError: if ``keep`` is out of range, NaN or not a number, if it is :func:`found_by_trying`, or if the scene
+            is empty.
 
     Example:
-        >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0), resolve_keep(1000, "25%")
-        (300, 1, 1000, 250)
-        >>> resolve_keep(1000, 2000), resolve_keep(1000, Megabytes(0.1), sh_degree=0)
-        (1000, 1000)
+        >>> [resolve_keep(1000, keep) for keep in (0.3, 1, 1.0, "25%", 2000)]
+        [300, 1, 1000, 250, 1000]
     """
     if isinstance(keep, str):
         keep = parse_keep(keep)

@@ -64,12 +64,8 @@ def method_named(by: str, opacity_weight: float | None = None) -> Method:
 
 @dataclass(frozen=True)
 class PruneSettings:
-    """Pruning settings that apply to many scenes, as in training.
-
-    Raises:
-        PointSplatError: if there is no such method, it needs views, or it has no opacity weight but is given one.
-        BudgetError: if ``keep`` is neither a ratio nor a count.
-    """
+    """Pruning settings that apply to many scenes, as in training. Raises BudgetError if ``keep`` is neither a ratio nor
+    a count, and PointSplatError if the method needs views, or for what :func:`method_named` refuses."""
 
     keep: float | int
     """Ratio (float, at most 1) or count (int)."""

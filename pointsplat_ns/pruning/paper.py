@@ -88,16 +88,9 @@ def of_usable(scene: Gaussians, score: Callable[[Gaussians], Tensor]) -> Tensor:
 
 
 def select(scores: Tensor, k: int) -> Tensor:
-    """Indices of the ``k`` highest scores: exactly K Gaussians.
+    """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf allowed.
 
     Of equal scores, the lower index is taken first; NaN ranks below every number.
-
-    Args:
-        scores: (N,), any floating type; +-Inf allowed.
-        k: number of indices, 0 to N.
-
-    Returns:
-        Indices (k,) int64, ascending.
 
     Raises:
         BudgetError: if ``k`` is not in 0..N.

@@ -32,11 +32,8 @@ def band_energies(scene: Gaussians) -> list[float]:
 
 
 def energy_lost(scene: Gaussians, degree: int) -> float:
-    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to an SH degree.
-
-    Returns:
-        In [0, 1]; 0 if there is none to lose.
-    """
+    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to an SH degree, in
+    [0, 1]; 0 if there is none to lose."""
     energies = band_energies(scene)
     total = sum(energies)
     return sum(energies[degree:]) / total if total > 0 else 0.0

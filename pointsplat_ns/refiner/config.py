@@ -34,9 +34,8 @@ class RefinerConfigError(PointSplatError, ValueError):
 class RefinerConfig:
     """All settings of a refiner's network.
 
-    The defaults are the preset ``full``, the published network. Tuples of the encoder have one entry per stage;
-    ``strides`` and the tuples of the decoder have one entry fewer, finest first. Raises RefinerConfigError if the
-    fields contradict one another.
+    The defaults are the preset ``full``, the published network. Tuples of the encoder have one entry per stage, finest
+    first; ``strides`` and the tuples of the decoder one fewer. Raises RefinerConfigError if fields contradict others.
     """
 
     sh_degree: int = MAX_SH_DEGREE
@@ -50,14 +49,12 @@ class RefinerConfig:
     feature_dim: int = 32
     """Channels of each encoder branch."""
     unit_gate: bool = False
-    """Multiply the softmax gate by its number of channels, so that gates average 1 and not 1/32. The next layer could
-    learn this factor, but training is faster with it."""
+    """Multiply the softmax gate by its number of channels, so that gates average 1: training is faster."""
     color_hidden: int = 32
     color_dim: int = 8
     """Hidden and output channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     raw_inputs: bool = False
-    """Give the encoder log-scales in units of the cube and opacity logits as they are. By default both are brought to
-    order 1, which softens the imbalance of one concatenated vector."""
+    """Give the encoder log-scales in units of the cube and opacity logits as they are, not brought to order 1."""
     stem: Literal["conv", "linear"] = "conv"
     """First layer of the backbone, before its norm and GELU: a 3x3x3 convolution, or a linear layer of each point (the
     published code)."""
@@ -82,9 +79,8 @@ class RefinerConfig:
     curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
     norm: Literal["scene", "batch"] = "scene"
-    """Normalisation outside the attention blocks. ``scene`` takes each channel's mean and variance over the points of
-    the current scene, in training and in evaluation. In training the published ``batch`` does the same, as a step sees
-    one scene; but in evaluation it uses running averages over scenes, which fit no single scene."""
+    """Normalisation outside the attention blocks, by each channel's mean and variance over the points of the current
+    scene. In evaluation the published ``batch`` uses running averages over scenes, which fit no single scene."""
     head_width: int = 128
     head_depth: int = 4
     """Hidden width and number of linear layers of each output head."""
@@ -147,7 +143,7 @@ def _check(name: str, kind: str, value: Any) -> None:
         fits, expected = isinstance(value, bool), "true or false"
     else:
         least, most = _RANGES.get(name, (1, 1 << 16))  # the published network has 1024 at most
-        types: tuple[type, ...] = (int, float) if kind == "float" else (int,)
+        types: Any = (int, float) if kind == "float" else int
         # NaN is in no range
         fits = all(isinstance(n, types) and not isinstance(n, bool) and least <= n <= most for n in parts)
         expected = f"{'numbers' if kind == 'float' else 'whole numbers'} from {least} to {most}"

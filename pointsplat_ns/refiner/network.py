@@ -74,8 +74,7 @@ class BatchNorm(nn.BatchNorm1d):
 class SceneNorm(nn.Module):
     """Normalises each channel over the points of the current scene: ``[N, C] -> [N, C]``.
 
-    As batch norm in training, but also in evaluation: there are no running statistics. A single point, which has no
-    variance, is its own mean.
+    There are no running statistics. A single point, which has no variance, is its own mean.
     """
 
     def __init__(self, channels: int):

@@ -136,10 +136,9 @@ def gaussian_features(
     """Network input of a scene of N usable Gaussians, with its unit cube, for so many SH coefficients of degree 1 and
     higher a colour channel, in the network's floating type.
 
-    Positions are centred and divided by one extent, which keeps the aspect ratio; log-scales are shifted by the
-    logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
-    residuals are added to the original parameters. Trained weights depend on these units and limits. With ``raw``,
-    log-scales in units of the cube and logits are clamped alike, but neither shifted nor scaled to order 1.
+    The input does not depend on the scene's unit and position. Only the input is clamped: residuals are added to the
+    original parameters. Trained weights depend on these units and limits. With ``raw``, log-scales in units of the cube
+    and logits are clamped alike, but neither shifted nor scaled to order 1.
     """
     # -5 is a typical log-scale in the unit cube: 4 cm in a room of 6 m
     centre, spread, logit_spread = (0.0, 1.0, 1.0) if raw else (-5.0, 2.0, 4.0)
@@ -163,10 +162,9 @@ def gaussian_features(
 def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Unit quaternions (N, 4) of one sign, and their signed lengths (N, 1), of finite wxyz of any length.
 
-    A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
-    Quaternions shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of
-    1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
-    overflow.
+    The first non-zero component of the result is positive. Quaternions shorter than
+    :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of 1. Components are divided
+    by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not overflow.
     """
     quats = zero_as_identity(quats)
     largest = quats.abs().amax(dim=1, keepdim=True).detach()

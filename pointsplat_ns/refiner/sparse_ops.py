@@ -129,14 +129,7 @@ def by_rows(
     """``function(x)``, on a CPU computed from ``rows`` rows at a time. # [N, Cout]"""
     if x.device.type != "cpu" or len(x) <= rows:
         return function(x)
-    if torch.is_grad_enabled():
-        return torch.cat([function(part) for part in x.split(rows)])
-    first = function(x[:rows])
-    out = first.new_empty(len(x), *first.shape[1:])
-    out[:rows] = first
-    for start in range(rows, len(x), rows):
-        out[start : start + rows] = function(x[start : start + rows])
-    return out
+    return torch.cat([function(part) for part in x.split(rows)])
 
 
 def by_patches(

@@ -1,8 +1,7 @@
 """Where the Gaussians of a scene are: its unit cube, and the grids and curves by which the network finds neighbours.
 
-All of it follows from positions alone. It is built once for a scene and used at every step. Points are stored along the
-first curve of the configuration, so that the points of a cell are consecutive at every level, and neighbours are close
-in memory.
+All of it follows from positions alone. Points are stored along the first curve of the configuration, so that the points
+of a cell are consecutive at every level, and neighbours are close in memory.
 """
 
 from __future__ import annotations

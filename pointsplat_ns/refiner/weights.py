@@ -122,11 +122,9 @@ def _json(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
         value = json.loads(header.get(key, "{}"))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: {key} is not JSON ({one_line(error)}); train or download it again") from error
-    if not isinstance(value, dict):
-        raise WeightsError(
-            f"{path}: {key} is {type(value).__name__}; expected a JSON object; train or download it again"
-        )
-    return value
+    if isinstance(value, dict):
+        return value
+    raise WeightsError(f"{path}: {key} is {type(value).__name__}; expected a JSON object; train or download it again")
 
 
 def _shape(tensors: dict[str, Any], name: str) -> tuple[int, ...] | str:

@@ -12,7 +12,6 @@ from pointsplat_ns.refiner import Refiner, preset, sparse_ops
 from pointsplat_ns.refiner.network import (
     BatchNorm,
     Block,
-    DualBranchEncoder,
     PatchAttention,
     SceneNorm,
     SubmanifoldConv,
@@ -156,26 +155,6 @@ def test_scene_norm_at_extremes_follows_float64(offset, spread):
         results.append(out.double())
     # at 1e4 float32 steps are a thousandth of the spread, and the mean is known to a few of them
     assert (results[0] - results[1]).abs().max() < 2e-2
-
-
-def features(n: int = 30):
-    scene = normal_scene(n)
-    return gaussian_features(scene, unit_cube(scene.means), 15, torch.float32)
-
-
-@pytest.mark.parametrize("unit_gate", [False, True])
-def test_the_encoder_is_equations_4_to_6_written_out(unit_gate):
-    torch.manual_seed(0)
-    encoder = DualBranchEncoder(preset("full", unit_gate=unit_gate)).eval()
-    f = features()
-    f_p = torch.cat([f.positions, f.quats, f.scales], dim=1)
-    f_a = torch.cat([f.opacities, f.features_dc, encoder.color(f.features_rest)], dim=1)
-    assert (f_p.shape[1], f_a.shape[1]) == (10, 12)
-    delta = encoder.position(f.positions)
-    weight = (encoder.appearance(f_a) + delta).exp()
-    weight = weight / weight.sum(dim=1, keepdim=True) * (32 if unit_gate else 1)
-    expected = weight * (encoder.geometry(f_p) + delta)
-    assert torch.allclose(encoder(f), expected, atol=1e-6)  # float32 softmax, values of order 1
 
 
 def test_submanifold_convolution_passes_gradcheck():
