@@ -127,41 +127,29 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
         i, j = first[part], second[part]
         k = place[i]
-        wi, *replacements = _replacements(state, i, j, settings)
-        for into, values in zip((after.means, after.cov, after.alphas), replacements, strict=True):
-            into[k] = values.to(into.dtype)
-        share = wi.float()
-        other = (1 - wi).float()
+        (ui, ci, ai), (uj, cj, aj) = (
+            (state.means[some].double(), state.cov[some].double(), state.alphas[some].double()) for some in (i, j)
+        )
+        mi, mj = ai * rms_area(ci), aj * rms_area(cj)
+        total = mi + mj
+        wi = torch.where(total > MIN_DIVISOR, mi / total.clamp_min(MIN_DIVISOR), 0.5)
+        wj = 1 - wi
+        apart = ui - uj
+        after.means[k] = (wi[:, None] * ui + wj[:, None] * uj).to(after.means.dtype)
+        cov = wi[:, None] * ci + wj[:, None] * cj + (wi * wj)[:, None] * outer(apart)
+        axes = plane_axes(thinnest_axes(cov))
+        si, sj, sk = (projected(c, *axes) for c in (ci, cj, cov))
+        u, v = ((apart * axis).sum(1) for axis in axes)
+        mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
+        alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)
+        after.cov[k] = (cov * growth(alphas, settings)[:, None]).clamp(-1e30, 1e30).to(after.cov.dtype)
+        after.alphas[k] = alphas.clamp_max(settings.max_opacity).to(after.alphas.dtype)
+        share, other = wi.float(), wj.float()
         after.colours[k] = share[:, None] * state.colours[i] + other[:, None] * state.colours[j]
         after.weights[k] = share * state.weights[i] + other * state.weights[j]
         after.counts[k] = state.counts[i] + state.counts[j]
         shares[i], shares[j] = share, 1 - share
     return after, Round(place.int(), shares)
-
-
-def _replacements(state: State, i: Tensor, j: Tensor, settings: MergeSettings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Share of the first member, mean, covariance and opacity of the replacements of pairs (m,), (m,), float64."""
-    (ui, ci, ai), (uj, cj, aj) = (
-        (state.means[rows].double(), state.cov[rows].double(), state.alphas[rows].double()) for rows in (i, j)
-    )
-    mi, mj = ai * rms_area(ci), aj * rms_area(cj)
-    total = mi + mj
-    wi = torch.where(total > MIN_DIVISOR, mi / total.clamp_min(MIN_DIVISOR), 0.5)
-    wj = 1 - wi
-    apart = ui - uj
-    mean = wi[:, None] * ui + wj[:, None] * uj
-    cov = wi[:, None] * ci + wj[:, None] * cj + (wi * wj)[:, None] * outer(apart)
-    axes = plane_axes(thinnest_axes(cov))
-    si, sj, sk = (projected(c, *axes) for c in (ci, cj, cov))
-    u, v = ((apart * axis).sum(1) for axis in axes)
-    mass = ai * projected_area(si) + aj * projected_area(sj) - ai * aj * overlap(si, sj, u, v)
-    alphas = mass.clamp_min(0) / projected_area(sk).clamp_min(MIN_DIVISOR)
-    return wi, mean, enlarged(cov, alphas, settings).clamp(-1e30, 1e30), alphas.clamp_max(settings.max_opacity)
-
-
-def enlarged(cov: Tensor, alphas: Tensor, settings: MergeSettings) -> Tensor:
-    """Covariances (n, 6) with the area that needed opacities (n,) above ``max_opacity`` ask for."""
-    return cov * growth(alphas, settings)[:, None]
 
 
 def growth(alphas: Tensor, settings: MergeSettings) -> Tensor:

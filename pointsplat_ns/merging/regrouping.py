@@ -23,7 +23,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import NearestOf
 from pointsplat_ns.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
 from pointsplat_ns.merging.groups import Groups
-from pointsplat_ns.merging.pairs import enlarged
+from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
@@ -117,7 +117,7 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
         group,
         shares,
         common.means,
-        enlarged(common.cov, alphas, settings),
+        common.cov * growth(alphas, settings)[:, None],
         alphas.clamp_max(settings.max_opacity),
         common.sizes.to(torch.int32),
     )
