@@ -18,8 +18,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.merging import MERGING, merge
-from pointsplat_ns.merging.matching import cheapest_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.pairs import cheapest_pairs
 from pointsplat_ns.merging.state import Participants, initial_state
 from pointsplat_ns.pruning.paper import paper_score
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
@@ -210,8 +210,8 @@ def _merge(given: Case, scene: Gaussians, truth: Gaussians) -> dict[str, float]:
 
 def _pairs(near: Tensor, costs: Tensor, most: int) -> set[tuple[int, int]]:
     """What one round would merge."""
-    first, second = cheapest_pairs(near, costs.float().clone(), most)
-    return set(zip(first.tolist(), second.tolist(), strict=True))
+    first, second, _ = cheapest_pairs(near, costs.float())
+    return set(zip(first[:most].tolist(), second[:most].tolist(), strict=True))
 
 
 def _colours(scene: Gaussians, case: Case) -> Tensor:

@@ -51,10 +51,7 @@ Bands = Literal["all", "auto", "0", "1", "2", "3"]
 Force = Annotated[bool, tyro.conf.arg(help="overwrite existing files.")]
 Jobs = Annotated[
     int | None,
-    tyro.conf.arg(
-        help="for a folder, or for a scene that prune merges in parts: number of processes that share the work and the "
-        "cores; by default 1."
-    ),
+    tyro.conf.arg(help="for a folder: number of processes that share the work and the cores; by default 1."),
 ]
 Verbose = Annotated[bool, tyro.conf.arg(help="print more: what was chosen for the scene.")]
 Json = Annotated[

@@ -19,7 +19,7 @@ from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import bytes_text, logger
+from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
@@ -70,9 +70,7 @@ def prune_scene(
     merging = request.method.score is None
     report = functools.partial(progress, "merging" if merging else f"scoring by {request.by}")
     if count is not None and merging:
-        merged = merge(start, count, report, views.for_merging())
-        logger.debug("%s", merged.finish.note)
-        scene = merged.scene
+        scene = merge(start, count, report, views.for_merging()).scene
     elif count is not None:
         scene = start[select(score_of(start, request.method, scored, request.opacity_weight, report), count)]
     else:

@@ -4,8 +4,7 @@ Over a few rounds, pairs of neighbours are replaced by one Gaussian each. README
 in the order of :mod:`~pointsplat_ns.merging.rounds`.
 """
 
-from pointsplat_ns.merging.finishing import Finish
 from pointsplat_ns.merging.rounds import Merged, Merger, merge, merge_levels
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 
-__all__ = ["MERGING", "Finish", "MergeSettings", "Merged", "Merger", "merge", "merge_levels"]
+__all__ = ["MERGING", "MergeSettings", "Merged", "Merger", "merge", "merge_levels"]

@@ -7,7 +7,7 @@
 4. In each cell, members are regrouped, and their rows are written.
 
 What a step has written is kept, and a command that was killed resumes from there. Several processes may share the
-cells. Files hold all that passes between them.
+cells.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import functools
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +32,12 @@ from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
-from pointsplat_ns.merging.matching import candidate_pairs
 from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import (
-    OF_EACH,
-    ColourAxes,
-    Participants,
-    State,
-    drawable,
-    initial_state,
-    principal_axes,
-)
+from pointsplat_ns.merging.state import Participants, State, drawable, initial_state, principal_axes
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
@@ -105,26 +96,24 @@ def merge_file(
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     with Workers(work, jobs) as workers:
 
-        def each(what: str, step: Callable[..., None], *args: object) -> None:
-            """Take a step of every cell."""
+        def each(what: str, *step: float) -> None:
+            """Every cell takes a step."""
             progress(what, 0.0)
-            steps = [(step, cell, *args) for cell in range(len(cells))]
-            for done, _ in enumerate(workers.results(steps), 1):
+            for done, _ in enumerate(workers.results([(cell, *step) for cell in range(len(cells))]), 1):
                 progress(what, done / len(cells))
 
         rounds, left = 0, -1
         while left != k:
-            chosen = _chosen(rounds)
-            if not scratch.has(chosen):
-                each(f"merging, round {rounds + 1}", _Work.find, rounds)
-            left = int(scratch.tensors(chosen, functools.partial(work.choose, rounds))["left"])
+            if not scratch.has(_chosen(rounds)):
+                each(f"merging, round {rounds + 1}", rounds)
+            left = int(scratch.tensors(_chosen(rounds), functools.partial(work.choose, rounds))["left"])
             rounds += 1
-        changes = [scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))]
-        each("finishing", _Work.finish, rounds, float(torch.cat(changes).mean()))
+        changes = torch.cat([scratch.known(_sizes(cell))["changes"] for cell in range(len(cells))])
+        each("finishing", rounds, float(changes.mean()))
     with replacing(output, ply_bytes(k, rows.sh_degree, rows.traits)) as part, part.open("wb") as stream:
         stream.write(header_bytes(k, rows.sh_degree, rows.traits))
         for cell in range(len(cells)):
-            with (scratch.folder / _finished(cell)).open("rb") as finished:
+            with _finished(scratch, cell).open("rb") as finished:
                 shutil.copyfileobj(finished, stream, 1 << 20)
     return cells.count, k
 
@@ -137,12 +126,8 @@ class Overview:
     size: Tensor  # scalar float64, diagonal of the content, scene units
     keys: Tensor  # [m] int64, ascending places on the curve
     weights: Tensor  # [m] float32, visibility weights there
-    middle: Tensor  # [3 (d+1)^2] of the axes of colours
+    middle: Tensor  # [3 (d+1)^2] as of principal_axes
     axes: Tensor  # [3 (d+1)^2, C]
-
-    def weights_at(self, keys: Tensor) -> Tensor:
-        """Visibility weights (n,) at places (n,) on the curve."""
-        return self.weights[torch.searchsorted(self.keys, keys).clamp_max_(len(self.keys) - 1)]
 
 
 def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -> Overview:
@@ -159,7 +144,7 @@ def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """The steps, whose results are kept. Called with one of its functions and their arguments, in any process."""
+    """The steps of cells. Called with a cell, the number of rounds before, and to finish it the change of sizes."""
 
     cells: Cells
     overview: Overview
@@ -168,18 +153,25 @@ class _Work:
     settings: MergeSettings
 
     def __call__(self, step: tuple[Any, ...]) -> None:
-        function, *args = step
-        function(self, *args)
-
-    def find(self, cell: int, number: int) -> None:
-        """Find the pairs of a cell that may be merged in a round."""
+        cell, rounds, *size_change = step
         scratch = self.cells.scratch
-        scratch.make(_round(number, cell), functools.partial(self._round, number, cell))
-        scratch.drop(_round(number - 2, cell))
+        if not size_change:
+            scratch.make(_round(rounds, cell), functools.partial(self.pairs, rounds, cell))
+            scratch.drop(_round(rounds - 2, cell))
+        elif not (path := _finished(scratch, cell)).is_file():
+            with replacing(path) as part:
+                self.write(rounds, cell, size_change[0], part)
 
-    def finish(self, cell: int, rounds: int, size_change: float) -> None:
-        """Write the rows of a cell after so many rounds."""
-        self.cells.scratch.file(_finished(cell), functools.partial(self._write, rounds, cell, size_change))
+    def pairs(self, number: int, cell: int) -> dict[str, Tensor]:
+        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it, and the pairs that
+        may be merged next."""
+        with one_thread_each():
+            state, group = self.state(number, cell)
+            near = other_neighbours(state.means.double(), self.settings.neighbours)
+            costs = pair_costs(state, near, self.settings)
+            first, second, prices = cheapest_pairs(near, costs, self.settings.matching_passes)
+        pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
+        return {**vars(state), "group": group.int(), **pairs}
 
     def choose(self, number: int) -> dict[str, Tensor]:
         """Which pairs of each cell, (E,) bool by its number, are the cheapest of all, and how many Gaussians are
@@ -196,44 +188,31 @@ class _Work:
         parts = chosen.split([len(part) for part in prices])
         return {**{f"{cell}": part for cell, part in enumerate(parts)}, "left": left - chosen.sum()}
 
-    def _round(self, number: int, cell: int) -> dict[str, Tensor]:
-        """The state of a cell after ``number`` rounds, the ``group`` (n,) of each participant in it, and the pairs that
-        may be merged next."""
-        with one_thread_each():
-            state, group = self._state(number, cell)
-            near = other_neighbours(state.means.double(), self.settings.neighbours)
-            costs = pair_costs(state, near, self.settings)
-            first, second, prices = candidate_pairs(near, costs, self.settings.matching_passes)
-        pairs = {"firsts": first.int(), "seconds": second.int(), "prices": prices}
-        return {**{name: getattr(state, name) for name in OF_EACH}, "group": group.int(), **pairs}
-
-    def _state(self, number: int, cell: int) -> tuple[State, Tensor]:
+    def state(self, number: int, cell: int) -> tuple[State, Tensor]:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
+        scratch, overview = self.cells.scratch, self.overview
         if number == 0:
-            state = self._first_state(cell)
+            participants = self.participants(cell)
+            scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
+            places = self.cells.keys_of(participants.scene)[participants.members]
+            nearest = torch.searchsorted(overview.keys, places).clamp_max_(len(overview.keys) - 1)
+            state = initial_state(participants, overview.weights[nearest], (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
-        scratch = self.cells.scratch
         before = scratch.known(_round(number - 1, cell))
-        of_each = {name: before[name] for name in OF_EACH}
-        state = State(**of_each, centre=self.overview.centre, size=float(self.overview.size))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
         first, second = (before[name][chosen].long() for name in ("firsts", "seconds"))
-        after, merged = replace_pairs(state, first, second, self.settings)
+        earlier = State(**{field.name: before[field.name] for field in fields(State)})
+        after, merged = replace_pairs(earlier, first, second, self.settings)
         return after, merged.place[before["group"]].long()
 
-    def _first_state(self, cell: int) -> State:
-        participants = self._participants(cell)
-        self.cells.scratch.tensors(_sizes(cell), functools.partial(self._size_changes, cell, participants))
-        weights = self.overview.weights_at(self.cells.keys_of(participants.scene)[participants.members])
-        return initial_state(participants, weights, ColourAxes(self.overview.middle, self.overview.axes))
-
-    def _participants(self, cell: int) -> Participants:
+    def participants(self, cell: int) -> Participants:
+        """The participants of a cell, along the curve."""
         scene = self.cells.read(cell)
         members = drawable(scene, -(-len(scene) * self.k // self.cells.count))
         order = self.cells.keys_of(scene)[members].argsort(stable=True)
         return Participants(scene, members[order], self.overview.centre, float(self.overview.size))
 
-    def _size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
+    def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """The finish of the parts in this cell, of four parts that are evenly spread over all cells.
 
         In five scenes, an eighth of a scene at a time, their mean factor differs from that of the whole by 0.02 at
@@ -246,15 +225,14 @@ class _Work:
                 start = max(0, int(place * len(participants)) - size // 2)
                 part = participants.scene[participants.members[start : start + size]]
                 few = max(1, len(part) * self.k // self.cells.count)
-                merged = merge(part, few, views=self.sampler(part), settings=self.settings)
-                changes.append(merged.finish.size_change)
+                changes.append(merge(part, few, views=self.sampler(part), settings=self.settings).size_change)
         return {"changes": torch.tensor(changes, **FLOATS)}
 
-    def _write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
-        """Regroup the members of a cell, and write the rows of its groups."""
+    def write(self, rounds: int, cell: int, size_change: float, path: Path) -> None:
+        """Regroup the members of a cell after so many rounds, and write the rows of its groups."""
         with one_thread_each():
-            state, group = self._state(rounds, cell)
-            participants = self._participants(cell)
+            state, group = self.state(rounds, cell)
+            participants = self.participants(cell)
             groups = Groups.of(participants, state, [Round(group, torch.ones(len(group), **FLOATS))])
             del state
             if groups.any_merged:
@@ -270,9 +248,9 @@ def _chosen(number: int) -> str:
     return f"chosen_{number}"
 
 
-def _finished(cell: int) -> str:
-    return f"finished_{cell:04d}.rows"
-
-
 def _sizes(cell: int) -> str:
     return f"sizes_{cell:04d}"
+
+
+def _finished(scratch: Scratch, cell: int) -> Path:
+    return scratch.folder / f"finished_{cell:04d}.rows"

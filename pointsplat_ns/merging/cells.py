@@ -19,15 +19,7 @@ from torch import Tensor
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_cells
-from pointsplat_ns.io.files import (
-    logger,
-    one_line,
-    read_text,
-    replacing,
-    require_space,
-    write_json,
-    write_tensors,
-)
+from pointsplat_ns.io.files import logger, one_line, read_text, require_space, write_json, write_tensors
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.usable import usable_part
 from pointsplat_ns.system.tensors import INDICES
@@ -68,19 +60,19 @@ class Scratch:
             require_space(folder, folder, size)
             write_json(work, known)
 
-    def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
-        """The tensors of a step, which is taken if it was not before."""
-        self.make(name, make)
-        return self.known(name)
+    def has(self, name: str) -> bool:
+        """Whether a step was taken that gave tensors."""
+        return self._path(name).is_file()
 
     def make(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> None:
         """Take a step that gives tensors, unless it was taken before."""
         if not self.has(name):
             write_tensors(self._path(name), make(), {})
 
-    def has(self, name: str) -> bool:
-        """Whether a step was taken that gave tensors."""
-        return self._path(name).is_file()
+    def tensors(self, name: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
+        """The tensors of a step, which is taken if it was not before."""
+        self.make(name, make)
+        return self.known(name)
 
     def known(self, name: str) -> dict[str, Tensor]:
         """The tensors of a step that was taken. Raises SceneError if its file is gone or damaged."""
@@ -95,14 +87,6 @@ class Scratch:
     def drop(self, name: str) -> None:
         """Remove the tensors of a step, if they are there."""
         self._path(name).unlink(missing_ok=True)
-
-    def file(self, name: str, make: Callable[[Path], None]) -> Path:
-        """The file of a step, which is taken if it was not before: ``make`` writes to a path that is renamed then."""
-        path = self.folder / name
-        if not path.is_file():
-            with replacing(path) as part:
-                make(part)
-        return path
 
     def remove(self) -> None:
         """Remove the folder."""

@@ -32,9 +32,12 @@ def covariances(log_scales: Tensor, quats: Tensor) -> Tensor:
 
 def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None) -> Tensor:
     """:func:`covariances` (m, 6) of the Gaussians ``rows`` (m,) of a scene; ``compiled`` False leaves it to torch."""
-    if KERNELS.usable_for(compiled, scene.scales, scene.quats):
-        return _by_kernels(scene.scales, scene.quats, rows)
-    return in_pieces(lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()), rows, 6)
+    if not KERNELS.usable_for(compiled, scene.scales, scene.quats):
+        return in_pieces(lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()), rows, 6)
+    cov, scales, quats = torch.empty(len(rows), 6, **DOUBLES), scene.scales.contiguous(), scene.quats.contiguous()
+    task = KERNELS.structs["Shapes"](log_scales=scales, quats=quats, rows=rows.contiguous(), count=len(rows), cov=cov)
+    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task, threads=most_threads())
+    return cov
 
 
 def pack(matrix: Tensor) -> Tensor:
@@ -133,13 +136,3 @@ def overlap(first: Tensor, second: Tensor, u: Tensor, v: Tensor) -> Tensor:
     distance = (both[:, 2] * u * u - 2 * both[:, 1] * u * v + both[:, 0] * v * v) / area / area
     large, small = (order(projected_area(first), projected_area(second)) for order in (torch.maximum, torch.minimum))
     return small * (large / area).clamp_max(1) * torch.exp(-0.5 * distance.clamp_min(0))
-
-
-def _by_kernels(log_scales: Tensor, quats: Tensor, rows: Tensor) -> Tensor:
-    """As :func:`covariances`, (m, 6), for the rows (m,) of float32 log-scales and quaternions."""
-    cov = torch.empty(len(rows), 6, **DOUBLES)
-    task = KERNELS.structs["Shapes"](
-        log_scales=log_scales.contiguous(), quats=quats.contiguous(), rows=rows.contiguous(), count=len(rows), cov=cov
-    )
-    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task, threads=most_threads())
-    return cov

@@ -1,4 +1,8 @@
-"""The groups of Gaussians that were merged, and the scene of one Gaussian for each group."""
+"""The groups of Gaussians that were merged, the scene of one Gaussian for each group, and one factor for their sizes.
+
+How large a merged Gaussian must be to look like its members depends on how these overlap and on what is behind them,
+and differs between scenes. The factor is chosen by the PSNR against renders of the dense scene.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import quaternions_of
 from pointsplat_ns.merging.covariance import MIN_DIVISOR, unpack
-from pointsplat_ns.merging.replacement import Round
+from pointsplat_ns.merging.pairs import Round
 from pointsplat_ns.merging.settings import MergeSettings
 from pointsplat_ns.merging.state import Participants, State
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
@@ -25,7 +29,6 @@ class Groups:
 
     group: Tensor  # [n] int64, the group of each participant
     shares: Tensor  # [n] float32, of each participant in the mass of its group
-    first: Tensor  # [K] int64, index in the scene of the first member
     means: Tensor  # [K, 3] float64, scene units
     cov: Tensor  # [K, 6] float64, squared scene units
     alphas: Tensor  # [K] float64
@@ -37,19 +40,14 @@ class Groups:
         group, shares = torch.arange(len(state), **INDICES), torch.ones(len(state), **FLOATS)
         for place, share in reversed(rounds):
             group, shares = group[place], shares[place] * share
-        first = first_members(participants, group, len(state))
-        return cls(group, shares, first, *state.in_scene_units(), state.alphas.double(), state.counts)
+        means = state.means.double() * participants.size + participants.centre
+        cov = state.cov.double() * participants.size**2
+        return cls(group, shares, means, cov, state.alphas.double(), state.counts)
 
     @property
     def any_merged(self) -> bool:
         """Whether any group has more than one member."""
-        return len(self.group) > len(self.first)
-
-
-def first_members(participants: Participants, group: Tensor, count: int) -> Tensor:
-    """Index in the scene of the first member of each of ``count`` groups, (K,) int64."""
-    first = torch.full((count,), len(participants.scene), **INDICES)
-    return first.scatter_reduce_(0, group, participants.members, "amin")
+        return len(self.group) > len(self.counts)
 
 
 def scene_maker(
@@ -61,13 +59,12 @@ def scene_maker(
         The group (n,) of each participant, and a function from a size change, which is added to the log-scales of
         merged Gaussians, to the scene.
     """
-    order = groups.first.argsort()
+    first = torch.full((len(groups.counts),), len(participants.scene), **INDICES)  # index in the scene of each
+    first, order = first.scatter_reduce_(0, groups.group, participants.members, "amin").sort()
     rank = torch.empty_like(order)
     rank[order] = torch.arange(len(order), **INDICES)
     group, shares = rank[groups.group], groups.shares
-    first, means, cov, alphas, members = (
-        values[order] for values in (groups.first, groups.means, groups.cov, groups.alphas, groups.counts)
-    )
+    means, cov, alphas, members = (values[order] for values in (groups.means, groups.cov, groups.alphas, groups.counts))
     del groups
     scene, counts = participants.scene, members.double()
     single = (counts == 1)[:, None]
@@ -125,3 +122,32 @@ def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
     return scales, quats
+
+
+def best_size_change(psnr_of: Callable[[float], float]) -> float:
+    """The best size change of those tried: three, and the top of the parabola through them, a little outside of them at
+    most. ``psnr_of`` gives the PSNR of the scene with a size change, dB."""
+    changes = (-0.1, 0.0, 0.05)
+    tried = {change: psnr_of(change) for change in changes}
+    top = top_of_parabola(changes, list(tried.values()), margin=0.05)
+    tried[top] = psnr_of(top)
+    return max(tried, key=lambda change: tried[change])
+
+
+def top_of_parabola(at: tuple[float, float, float], values: list[float], margin: float) -> float:
+    """Where the parabola through three points is highest, at most ``margin`` outside of them. If it has no top, as far
+    out if the values only rise that way, else the best of the three.
+
+    Example:
+        >>> round(top_of_parabola((0.0, 1.0, 3.0), [-4.0, -1.0, -1.0], margin=0.0), 6)
+        2.0
+    """
+    (a, b, c), (p, q, r) = at, values
+    left, right = (q - p) / (b - a), (r - q) / (c - b)
+    bend = (right - left) / (c - a)
+    if bend >= 0 and left * right > 0:
+        return c + margin if right > 0 else a - margin
+    if bend >= 0 or bend != bend:
+        return at[max(range(3), key=lambda index: values[index])]
+    top = 0.5 * (a + b) - 0.5 * left / bend
+    return min(max(top, a - margin), c + margin)

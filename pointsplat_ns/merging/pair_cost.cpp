@@ -1,9 +1,7 @@
 // What pairs cost, for float32 on a CPU.
 //
 // pair_cost.py calls this file where it was built. It does the same in torch, and has the formulas, the bounds and the
-// names that are used here. A vector holds up to eight neighbours of one Gaussian.
-
-#include <new>
+// names that are used here. A vector holds the neighbours of one Gaussian, eight at most.
 
 #include "lanes.h"
 
@@ -32,7 +30,7 @@ namespace {
 
 constexpr int PLANES = 13;
 constexpr int TABLE = 12;  // mean, covariance, opacity, squared length of the colour, direction
-constexpr int MOST_AXES = 16, MOST_BLOCKS = 4;
+constexpr int MOST_AXES = 8;
 constexpr double MOST = 1e3;  // bound of coordinates and of standard deviations
 constexpr float ROUNDNESS = 1e-5, MIN_VARIANCE = 1e-6 * 1e-6, TINY = 1e-30;
 
@@ -141,86 +139,67 @@ void pointsplat_pair_costs(const Costs* task, int64_t* next) {
     const float assumed = 3.0 * 0.01 * 0.01, hole = 3.0 * 0.3 * 0.3, min_cover = c.min_cover;
     const float max_opacity = c.max_opacity, exponent = c.growth_exponent, max_ratio = 4.0, max_growth = 100.0;
     const int neighbours = static_cast<int>(c.neighbours), axes = static_cast<int>(c.axes);
-    const int blocks = (neighbours + LANES - 1) / LANES;
     each_range(next, c.count, [&](int64_t, int64_t first_row, int64_t last_row) {
-        alignas(Some) unsigned char room[MOST_BLOCKS * sizeof(Some)];
-        Some* others = reinterpret_cast<Some*>(room);
         for (int64_t i = first_row; i < last_row; ++i) {
-            const int32_t self = static_cast<int32_t>(i), *near = c.near + neighbours * i;
-            const Some me(c, &self, 1);
-            Lane same[MOST_BLOCKS], total[MOST_BLOCKS];  // <c_i, c_j>; costs of all directions
-            for (int b = 0; b < blocks; ++b) {
-                new (others + b) Some(c, near + b * LANES, std::min(LANES, neighbours - b * LANES));
-                same[b] = total[b] = ZERO;
-                for (int axis = 0; axis < axes; ++axis) same[b] += me.colours[axis] * others[b].colours[axis];
-            }
+            const int32_t self = static_cast<int32_t>(i);
+            const Some me(c, &self, 1), other(c, c.near + neighbours * i, neighbours);
+            Lane same = ZERO, total = ZERO;  // <c_i, c_j>; costs of all directions
+            for (int axis = 0; axis < axes; ++axis) same += me.colours[axis] * other.colours[axis];
             const int largest = static_cast<int>(c.table[TABLE * i + 11]);
             for (int d = 0; d < 3; ++d) {
                 const Plane plane(c, static_cast<int>(c.planes.triples[largest][d]));
-                const Flat first = me.on(plane, me.mean);
-                Flat seconds[MOST_BLOCKS];
-                Lane overlaps[MOST_BLOCKS], around[MOST_AXES];
+                const Flat first = me.on(plane, me.mean), second = other.on(plane, me.mean);
+                const Lane u = second.u, v = second.v;
+                const Lane overlaps = overlap_of_sum(
+                    first.uu + second.uu, first.uv + second.uv, first.vv + second.vv, first.area * second.area, u, v);
+                Lane on_first = other.alpha * overlaps / first.area, around[MOST_AXES];
+                for (int lane = neighbours; lane < LANES; ++lane) on_first[lane] = 0.0f;
                 float cover = 0.5f * me.alpha[0];
                 for (int axis = 0; axis < axes; ++axis) around[axis] = cover * me.colours[axis];
-                for (int b = 0; b < blocks; ++b) {
-                    const Flat second = seconds[b] = others[b].on(plane, me.mean);
-                    overlaps[b] = overlap_of_sum(
-                        first.uu + second.uu, first.uv + second.uv, first.vv + second.vv, first.area * second.area,
-                        second.u, second.v);
-                    Lane on_first = others[b].alpha * overlaps[b] / first.area;
-                    for (int lane = neighbours - b * LANES; lane < LANES; ++lane) on_first[lane] = 0.0f;
-                    cover += sum(on_first);
-                    for (int axis = 0; axis < axes; ++axis) around[axis] += sum(on_first * others[b].colours[axis]);
-                }
+                cover += sum(on_first);
+                for (int axis = 0; axis < axes; ++axis) around[axis] += sum(on_first * other.colours[axis]);
                 const float per_cover = 1.0f / std::max(cover, TINY);
                 float rr = 0.0f, ir = 0.0f;
+                Lane jr = ZERO;
                 for (int axis = 0; axis < axes; ++axis) {
                     around[axis] *= per_cover;
                     rr += around[axis][0] * around[axis][0], ir += me.colours[axis][0] * around[axis][0];
+                    jr += other.colours[axis] * around[axis];
                 }
                 const float ii = std::max(me.squared_colour[0] - 2.0f * ir + rr, 0.0f) + assumed;
                 const float gii = 0.5f * me.alpha[0] * me.alpha[0] * first.area[0], mi = me.alpha[0] * first.area[0];
                 const float counted = 1.0f / (std::max(cover, min_cover) * std::max(cover, min_cover));
                 const float through = hole * std::exp(static_cast<float>(-c.background_decay) * cover);
-                for (int b = 0; b < blocks; ++b) {
-                    const Some& other = others[b];
-                    const Flat& second = seconds[b];
-                    Lane jr = ZERO;
-                    for (int axis = 0; axis < axes; ++axis) jr += other.colours[axis] * around[axis];
-                    const Lane jj = larger(other.squared_colour - 2.0f * jr + rr, ZERO) + assumed;
-                    const Lane ij = same[b] - jr + (rr - ir + assumed);
-                    const Lane u = second.u, v = second.v, both = me.alpha * other.alpha * overlaps[b];
-                    // the replacement
-                    const Lane mj = other.alpha * second.area;
-                    const Lane wi = mi / larger(mi + mj, ZERO + TINY), wj = 1.0f - wi, wu = wi * wj * u, wv = wi * wj * v;
-                    Lane uu = wu * u + wi * first.uu + wj * second.uu;
-                    Lane uv = wu * v + wi * first.uv + wj * second.uv;
-                    Lane vv = wv * v + wi * first.vv + wj * second.vv;
-                    Lane area = root(larger(uu * vv - uv * uv, ZERO + TINY));
-                    Lane alpha = larger(mi + mj - both, ZERO) / area;
-                    const Lane factor = each(alpha, [&](float value) {
-                        return value > max_opacity ? std::pow(std::min(value / max_opacity, max_ratio), exponent) : 1.0f;
-                    });
-                    uu *= factor, uv *= factor, vv *= factor, area *= factor;
-                    alpha = smaller(alpha, ZERO + max_opacity);
-                    const Lane oik = overlap_of_sum(
-                        first.uu + uu, first.uv + uv, first.vv + vv, first.area * area, wj * u, wj * v);
-                    const Lane ojk = overlap_of_sum(
-                        second.uu + uu, second.uv + uv, second.vv + vv, second.area * area, wi * u, wi * v);
-                    // the changes
-                    const Lane ik = wi * ii + wj * ij, jk = wj * jj + wi * ij, kk = wi * ik + wj * jk;
-                    const Lane gjj = 0.5f * other.alpha * other.alpha * second.area, gkk = 0.5f * alpha * alpha * area;
-                    const Lane gij = 2.0f * both, gik = 2.0f * me.alpha * alpha * oik, gjk = 2.0f * other.alpha * alpha * ojk;
-                    const Lane colour = jj * gjj + ii * gii + kk * gkk + ij * gij - ik * gik - jk * gjk;
-                    const Lane shape = gjj + gii + gkk + gij - gik - gjk;
-                    const Lane growth = smaller(area / (first.area + second.area), ZERO + max_growth);
-                    const Lane change = larger(colour, ZERO) * counted + larger(shape, ZERO) * through;
-                    total[b] += growth * growth * change;
-                }
+                const Lane jj = larger(other.squared_colour - 2.0f * jr + rr, ZERO) + assumed;
+                const Lane ij = same - jr + (rr - ir + assumed), both = me.alpha * other.alpha * overlaps;
+                // the replacement
+                const Lane mj = other.alpha * second.area;
+                const Lane wi = mi / larger(mi + mj, ZERO + TINY), wj = 1.0f - wi, wu = wi * wj * u, wv = wi * wj * v;
+                Lane uu = wu * u + wi * first.uu + wj * second.uu;
+                Lane uv = wu * v + wi * first.uv + wj * second.uv;
+                Lane vv = wv * v + wi * first.vv + wj * second.vv;
+                Lane area = root(larger(uu * vv - uv * uv, ZERO + TINY));
+                Lane alpha = larger(mi + mj - both, ZERO) / area;
+                const Lane factor = each(alpha, [&](float value) {
+                    return value > max_opacity ? std::pow(std::min(value / max_opacity, max_ratio), exponent) : 1.0f;
+                });
+                uu *= factor, uv *= factor, vv *= factor, area *= factor;
+                alpha = smaller(alpha, ZERO + max_opacity);
+                const Lane oik = overlap_of_sum(
+                    first.uu + uu, first.uv + uv, first.vv + vv, first.area * area, wj * u, wj * v);
+                const Lane ojk = overlap_of_sum(
+                    second.uu + uu, second.uv + uv, second.vv + vv, second.area * area, wi * u, wi * v);
+                // the changes
+                const Lane ik = wi * ii + wj * ij, jk = wj * jj + wi * ij, kk = wi * ik + wj * jk;
+                const Lane gjj = 0.5f * other.alpha * other.alpha * second.area, gkk = 0.5f * alpha * alpha * area;
+                const Lane gij = 2.0f * both, gik = 2.0f * me.alpha * alpha * oik, gjk = 2.0f * other.alpha * alpha * ojk;
+                const Lane colour = jj * gjj + ii * gii + kk * gkk + ij * gij - ik * gik - jk * gjk;
+                const Lane shape = gjj + gii + gkk + gij - gik - gjk;
+                const Lane growth = smaller(area / (first.area + second.area), ZERO + max_growth);
+                const Lane change = larger(colour, ZERO) * counted + larger(shape, ZERO) * through;
+                total += growth * growth * change;
             }
-            for (int b = 0; b < blocks; ++b)
-                for (int lane = 0; lane < std::min(LANES, neighbours - b * LANES); ++lane)
-                    c.costs[neighbours * i + b * LANES + lane] = total[b][lane] * c.weights[i];
+            for (int lane = 0; lane < neighbours; ++lane) c.costs[neighbours * i + lane] = total[lane] * c.weights[i];
         }
     });
 }

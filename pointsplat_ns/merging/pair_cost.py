@@ -14,15 +14,14 @@ and counts as well:
     cover_i = a_i / 2 + sum over neighbours j of a_j <G_i, G_j> / A_i                  mean of sum(a G) over G_i
     surroundings_i = the mean colour of that cover
 
-The factor g^2 is empirical: E and H do not see how a large replacement blurs what is merged with it later. On five
-scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers draw 6 % fewer Gaussians on a pixel; g^3 loses with poses.
+The factor g^2 is empirical. On five scenes it gains 0.2 dB at 10 % and 0.3 at 30 %, and viewers draw 6 % fewer
+Gaussians on a pixel; g^3 loses with poses.
 
 W_i is the visibility weight of i. c_0 = 0.01 and b = 0.3 are contrasts that are assumed, with the surroundings and with
 the far background; c_min and d are ``min_cover`` and ``background_decay`` of the settings.
 
-The replacement has the common mass, centre and covariance, as in
-:mod:`~pointsplat_ns.merging.replacement`, with areas in the plane. All integrals are sums of overlaps, which
-have a closed form:
+The replacement is that of :mod:`~pointsplat_ns.merging.pairs`, with areas in the plane. All integrals are sums of
+overlaps, which have a closed form:
 
     <G_p, G_q> = integral of G_p G_q = A_p A_q / A_pq * exp(-d_pq^2 / 2),   <G_p, G_p> = A_p / 2
 
@@ -30,7 +29,7 @@ A_pq is the area of the summed covariance S_p + S_q, and d_pq the Mahalanobis di
 
 The three directions are that of the thirteen axes and diagonals of a cube in which the projection of i is largest, and
 two across. Lengths are in units of the size of the scene's content, and bounded such that float32 holds squares of
-products of four of them. A compiled kernel (``pair_cost.cpp``) computes costs where it was built, or torch.
+products of four of them.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pointsplat_ns.merging.covariance import plane_axes
-from pointsplat_ns.merging.replacement import growth
+from pointsplat_ns.merging.covariance import plane_axes, projected
+from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
@@ -58,20 +57,6 @@ DIRECTIONS = torch.nn.functional.normalize(
 """Unit vectors (13, 3)."""
 
 
-def _projection_matrices() -> tuple[Tensor, Tensor]:
-    """For each direction the two axes of its plane, (13, 3, 2), and the matrix that turns the six numbers of a
-    covariance into the three of its projection, (13, 6, 3)."""
-    axes = torch.stack(plane_axes(DIRECTIONS), dim=2)
-    u, v = axes[..., 0], axes[..., 1]
-
-    def row(a: Tensor, b: Tensor) -> Tensor:
-        x, y, z = a.unbind(1)
-        p, q, r = b.unbind(1)
-        return torch.stack([x * p, x * q + y * p, x * r + z * p, y * q, y * r + z * q, z * r], dim=1)
-
-    return axes, torch.stack([row(u, u), row(u, v), row(v, v)], dim=2)
-
-
 def _perpendicular_triples() -> Tensor:
     """Indices (13, 3) of each direction and of two more, as perpendicular to it and to each other as there are."""
     cosines = (DIRECTIONS @ DIRECTIONS.T).abs()
@@ -83,7 +68,9 @@ def _perpendicular_triples() -> Tensor:
     return torch.tensor(rows, **INDICES)
 
 
-PLANE_AXES, TO_PLANE = _projection_matrices()
+PLANE_AXES = torch.stack(plane_axes(DIRECTIONS), dim=2)  # [13, 3, 2] of the plane of each direction
+TO_PLANE = torch.stack([projected(torch.eye(6, **DOUBLES), *axes.T[:, None].expand(2, 6, 3)) for axes in PLANE_AXES])
+"""For each direction the matrix from the six numbers of a covariance to the three of its projection, (13, 6, 3)."""
 TRIPLES = _perpendicular_triples()
 
 
@@ -107,7 +94,7 @@ def pair_costs(
         (n, k): squared colour units times solid angle, with the surroundings of the first of each pair.
     """
     # the largest numbers of neighbours and of colour axes that the kernel is made for
-    fits = near.shape[1] <= 32 and state.colours.shape[1] <= 16 and near.dtype == torch.int32
+    fits = near.shape[1] <= 8 and state.colours.shape[1] <= 8 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
     costs = torch.empty(near.shape, dtype=dtype, device="cpu")
@@ -196,8 +183,7 @@ def _within_bounds(state: State, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
     """As :func:`pair_costs`, float32."""
-    count, library = len(state), KERNELS.library
-    costs = torch.empty(near.shape, **FLOATS)
+    count, costs = len(state), torch.empty(near.shape, **FLOATS)
     tables = {"axes": PLANE_AXES, "to_plane": TO_PLANE, "triples": TRIPLES}
     planes = KERNELS.structs["Planes"](**{name: tuple(table.flatten().tolist()) for name, table in tables.items()})
     names = ("background_decay", "min_cover", "max_opacity", "growth_exponent")
@@ -207,6 +193,6 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
         axes=state.colours.shape[1], neighbours=near.shape[1], table=torch.empty(count, 12, **FLOATS),
         near=near.contiguous(), costs=costs,
     )  # fmt: skip
-    for function in (library.pointsplat_projected, library.pointsplat_pair_costs):
+    for function in (KERNELS.library.pointsplat_projected, KERNELS.library.pointsplat_pair_costs):
         on_threads(count >= SEVERAL, function, task, threads=most_threads())
     return costs

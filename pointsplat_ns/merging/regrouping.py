@@ -8,8 +8,7 @@ hard EM of a mixture of Gaussians whose data are Gaussians (Vasconcelos and Lipp
     fit = 1/2 (tr(S_g^-1 (S + (mu - mu_g)(mu - mu_g)^T)) + log det S_g) + |c - c_g|^2 / (2 contrast^2)
 
 The less, the better: the expected negative log-density of the group over the member, and the difference of colour. The
-mass of a member, by which the moments of a group are weighted, is opacity times root mean square area. A compiled
-kernel (``regrouping.cpp``) compares groups, or torch.
+mass of a member, by which the moments of a group are weighted, is opacity times root mean square area.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from torch import Tensor
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import NearestOf
 from pointsplat_ns.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
-from pointsplat_ns.merging.groups import Groups, first_members
-from pointsplat_ns.merging.replacement import enlarged
+from pointsplat_ns.merging.groups import Groups
+from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
@@ -51,12 +50,9 @@ class Members:
             alphas = torch.sigmoid(scene.opacities[some, 0].double())
             self.masses[these] = alphas * rms_area(covariances_of(scene, some))
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
     def pieces(self) -> Iterator[slice]:
         """All members, in pieces."""
-        return (slice(first, first + CHUNK) for first in range(0, len(self), CHUNK))
+        return (slice(first, first + CHUNK) for first in range(0, len(self._rows), CHUNK))
 
     def means(self, these: slice) -> Tensor:
         """Means (m, 3) float64 of a piece, scene units."""
@@ -120,9 +116,8 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
     return Groups(
         group,
         shares,
-        first_members(participants, group, count),
         common.means,
-        enlarged(common.cov, alphas, settings),
+        common.cov * growth(alphas, settings)[:, None],
         alphas.clamp_max(settings.max_opacity),
         common.sizes.to(torch.int32),
     )
@@ -176,61 +171,36 @@ def best_groups(
         settings: ``regrouping_contrast``.
         compiled: False leaves it to torch; True warns if there are no kernels.
     """
-    result = torch.empty_like(group)
-    fits, nearest = Fits.of(groups, settings), NearestOf(groups.means, 6)
+    inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
+    occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
+    for some in torch.arange(len(groups.mass), **INDICES).split(CHUNK):
+        cov = groups.cov[some]
+        variance = cov[:, (0, 3, 5)].mean(1).clamp_min(MIN_DIVISOR)
+        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES)  # invertible if flat
+        inverse[some] = pack(torch.linalg.inv(shapes)) * (occurrences / variance[:, None])
+        log_determinants[some] = torch.logdet(shapes) + 3 * variance.log()
+    colour_weight = 1 / (2 * settings.regrouping_contrast**2)
+
+    result, nearest = torch.empty_like(group), NearestOf(groups.means, 6)
     for these in members.pieces():
-        means, own = members.means(these), group[these]
-        piece, near = (means, members.cov(these), members.colours(these)), nearest(means)
+        means, cov, colours, own = members.means(these), members.cov(these), members.colours(these), group[these]
+        near = nearest(means)
         if KERNELS.usable(compiled):
-            result[these] = _by_kernels(*piece, own, near.int(), fits)
-        else:
-            result[these] = fits.best_of(*piece, torch.cat([own[:, None], near], dim=1))
+            best = torch.empty_like(own)
+            task = KERNELS.structs["Choice"](
+                means=means, cov=cov, colours=colours, group=own, near=near.int(), count=len(own),
+                candidates=near.shape[1], group_means=groups.means, inverse=inverse, best=best,
+                log_determinants=log_determinants, group_colours=groups.colours, colour_weight=colour_weight,
+            )  # fmt: skip
+            on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
+            result[these] = best
+            continue
+        candidates = torch.cat([own[:, None], near], dim=1)  # (m, 7)
+        apart = means[:, None] - groups.means[candidates]
+        second = cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
+        fit = 0.5 * ((second * inverse[candidates]).sum(2) + log_determinants[candidates])
+        fit += (colours[:, None] - groups.colours[candidates]).square().sum(2) * colour_weight
+        best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)  # the first of equals
+        result[these] = candidates.gather(1, best)[:, 0]
     heaviest = torch.zeros(len(groups.mass), **DOUBLES).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)
-
-
-@dataclass(frozen=True, eq=False)
-class Fits:
-    """Groups that members may fit."""
-
-    means: Tensor  # [K, 3] float64
-    inverse: Tensor  # [K, 6] float64 covariances, inverted, the numbers beside the diagonal twice
-    log_determinants: Tensor  # [K] float64
-    colours: Tensor  # [K, 3] float64
-    colour_weight: float
-    """Weight of the squared difference of colours."""
-
-    @classmethod
-    def of(cls, groups: Moments, settings: MergeSettings) -> Fits:
-        """The groups with some moments."""
-        inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
-        occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
-        for these in torch.arange(len(groups.mass), **INDICES).split(CHUNK):
-            cov = groups.cov[these]
-            variance = cov[:, (0, 3, 5)].mean(1).clamp_min(MIN_DIVISOR)
-            shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES)  # invertible if flat
-            inverse[these] = pack(torch.linalg.inv(shapes)) * (occurrences / variance[:, None])
-            log_determinants[these] = torch.logdet(shapes) + 3 * variance.log()
-        return cls(groups.means, inverse, log_determinants, groups.colours, 1 / (2 * settings.regrouping_contrast**2))
-
-    def best_of(self, means: Tensor, cov: Tensor, colours: Tensor, candidates: Tensor) -> Tensor:
-        """The candidate that each of m members fits best, of groups (m, c) int64; the first of equals."""
-        apart = means[:, None] - self.means[candidates]
-        second = cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
-        fit = 0.5 * ((second * self.inverse[candidates]).sum(2) + self.log_determinants[candidates])
-        contrast = colours[:, None] - self.colours[candidates]
-        fit += contrast.square().sum(2) * self.colour_weight
-        best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)
-        return candidates.gather(1, best)[:, 0]
-
-
-def _by_kernels(means: Tensor, cov: Tensor, colours: Tensor, group: Tensor, near: Tensor, fits: Fits) -> Tensor:
-    """As :meth:`Fits.best_of` for m members, each with its own group (m,) and the nearest (m, k) int32."""
-    best = torch.empty_like(group)
-    task = KERNELS.structs["Choice"](
-        means=means, cov=cov, colours=colours, group=group, near=near, count=len(group),
-        candidates=near.shape[1], group_means=fits.means, inverse=fits.inverse,
-        log_determinants=fits.log_determinants, group_colours=fits.colours, colour_weight=fits.colour_weight, best=best,
-    )  # fmt: skip
-    on_threads(len(group) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
-    return best

@@ -1,11 +1,8 @@
 """The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
 
 Everything is computed on one thread each, in pieces that several threads take: the result is the same bits on any
-number of threads, and no thread waits for another within an operation.
-
-Memory: besides the scene itself at most 0.35 kB a Gaussian. Freed blocks of other sizes would come on top of it, and
-are given back to the system before steps that take much. SH coefficients are read twice, in pieces: for the principal
-axes of colours, and at the end for the means of members.
+number of threads, and no thread waits for another within an operation. Besides the scene itself, at most 0.35 kB a
+Gaussian are taken; freed blocks are given back to the system before steps that take much.
 """
 
 from __future__ import annotations
@@ -21,13 +18,12 @@ from pointsplat_ns.comparing.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.merging.finishing import Finish, best_finish
-from pointsplat_ns.merging.groups import Groups, scene_maker
-from pointsplat_ns.merging.matching import cheapest_pairs
+from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.replacement import Round, replace_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
 from pointsplat_ns.merging.visibility import views_and_weights
@@ -44,8 +40,8 @@ class Merged:
     scene: Gaussians
     """K Gaussians in the order of their first members. Those not merged with any other are unchanged to the bit."""
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
-    finish: Finish
-    """The numbers chosen for this scene."""
+    size_change: float = 0.0
+    """Added to the log-scales of merged Gaussians, chosen by renders."""
 
 
 def merge(
@@ -57,7 +53,7 @@ def merge(
 ) -> Merged:
     """Replace a scene by ``k`` Gaussians that look the same.
 
-    Gaussians too faint to be drawn are dropped first. The others are merged in pairs, cheapest first.
+    Gaussians too faint to be drawn are dropped first.
 
     Args:
         scene: N Gaussians. Those that are not :meth:`~pointsplat_ns.gaussians.Gaussians.usable` are dropped, unless
@@ -121,12 +117,7 @@ class Merger:
         scene, views, settings: as for :func:`merge`.
     """
 
-    def __init__(
-        self,
-        scene: Gaussians,
-        views: Views | Sampler | None = None,
-        settings: MergeSettings = MERGING,
-    ):
+    def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
         self._scene, self._options = scene, (views, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
@@ -161,7 +152,7 @@ def _levels(
     n = len(scene)
     if n in counts:
         report(0.0 if len(counts) > 1 else 1.0)
-        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64), Finish())
+        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64))
         counts = counts[1:]
     if not counts:
         return
@@ -183,25 +174,6 @@ def _share_done(first: int, now: int, last: int) -> float:
     return 0.5 + 0.35 * (first - now) / max(first - last, 1)
 
 
-def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
-    """The result after some rounds, on a device."""
-    participants = step.participants
-    with one_thread_each():
-        groups = Groups.of(participants, step.state, step.rounds)
-        any_merged, reference, finish = groups.any_merged, step.reference, Finish()
-        if regroup and any_merged and settings.regrouping_rounds > 0:
-            groups = regrouped(participants, groups, settings)
-        give_back_freed_memory()
-        group, make = scene_maker(participants, groups, settings)
-        del groups
-        if reference is not None and any_merged:
-            finish = best_finish(lambda change: reference.psnr(participants.in_units(make(change))))
-        scene = make(finish.size_change)
-    assignment = torch.full((len(participants.scene),), -1, **INDICES)
-    assignment[participants.members] = group
-    return Merged(scene.to(device), assignment.to(device), finish)
-
-
 @dataclass(frozen=True, eq=False)
 class Step:
     """Everything that is known between two rounds."""
@@ -209,9 +181,13 @@ class Step:
     participants: Participants
     views: Views | None  # that visibility was computed in
     state: State
-    rounds: tuple[Round, ...]
-    reference: RendersOfSizes | None
+    rounds: tuple[Round, ...] = ()
+    reference: RendersOfSizes | None = None
     """Renders of the scene, or of what remained once it was few enough to render."""
+
+    def groups(self) -> Groups:
+        """The participants in groups, one for each Gaussian that remains."""
+        return Groups.of(self.participants, self.state, self.rounds)
 
 
 def first_step(
@@ -230,12 +206,7 @@ def first_step(
         found, weights = None, torch.ones(len(participants), **FLOATS)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
-
-        def dense() -> Gaussians:
-            return scene if len(participants) == len(scene) else scene[participants.members]
-
-        reference = _reference(participants, found, len(participants), dense, settings)
-        return Step(participants, found, initial_state(participants, weights), (), reference)
+        return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
@@ -245,35 +216,49 @@ def most_pairs(n: int, settings: MergeSettings) -> int:
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    participants, n = step.participants, len(step.state)
+    n = len(step.state)
     most = min(n - k, most_pairs(n, settings))
     with one_thread_each():
         give_back_freed_memory()
         near = other_neighbours(step.state.means.double(), settings.neighbours)
         costs = pair_costs(step.state, near, settings)
-        first, second = cheapest_pairs(near, costs, most, settings.matching_passes)
+        first, second, _ = cheapest_pairs(near, costs, settings.matching_passes)
         del near, costs
         give_back_freed_memory()
-        state, merged = replace_pairs(step.state, first, second, settings)
-        rounds = (*step.rounds, merged)
-
-        def remaining() -> Gaussians:
-            return scene_maker(participants, Groups.of(participants, state, rounds), settings)[1](0.0)
-
-        reference = step.reference or _reference(participants, step.views, len(state), remaining, settings)
-    return replace(step, state=state, rounds=rounds, reference=reference)
+        state, merged = replace_pairs(step.state, first[:most], second[:most], settings)
+        return _with_reference(replace(step, state=state, rounds=(*step.rounds, merged)), settings)
 
 
-def _reference(
-    participants: Participants,
-    views: Views | None,
-    count: int,
-    dense: Callable[[], Gaussians],
-    settings: MergeSettings,
-) -> RendersOfSizes | None:
-    """Renders of ``count`` Gaussians ``dense`` that results are compared with, in every few pixels of pictures of
-    the middle size; None if they are too many or there are no views."""
-    if views is None or count > settings.max_count_rendered or settings.finish_views < 1:
-        return None
-    views = participants.views_in_units(views.spread(settings.finish_views))
-    return RendersOfSizes(participants.in_units(dense()), views, [middle_side(views)])
+def _with_reference(step: Step, settings: MergeSettings) -> Step:
+    """A step with renders that results are compared with, in every few pixels of pictures of the middle size
+    (:func:`~pointsplat_ns.comparing.sizes.sides_of`), unless there are some, too many Gaussians, or no views."""
+    everyone, views = step.participants, step.views
+    if step.reference or views is None or len(step.state) > settings.max_count_rendered or settings.finish_views < 1:
+        return step
+    if step.rounds:
+        dense = scene_maker(everyone, step.groups(), settings)[1](0.0)
+    else:
+        dense = everyone.scene if len(everyone) == len(everyone.scene) else everyone.scene[everyone.members]
+    unit = everyone.centre, everyone.size
+    views = views_in_units(views.spread(settings.finish_views), *unit)
+    return replace(step, reference=RendersOfSizes(in_units(dense, *unit), views, [middle_side(views)]))
+
+
+def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
+    """The result after some rounds, on a device."""
+    participants, reference = step.participants, step.reference
+    with one_thread_each():
+        groups, size_change = step.groups(), 0.0
+        any_merged = groups.any_merged
+        if regroup and any_merged and settings.regrouping_rounds > 0:
+            groups = regrouped(participants, groups, settings)
+        give_back_freed_memory()
+        group, make = scene_maker(participants, groups, settings)
+        del groups
+        if reference is not None and any_merged:
+            unit = participants.centre, participants.size
+            size_change = best_size_change(lambda change: reference.psnr(in_units(make(change), *unit)))
+        scene = make(size_change)
+    assignment = torch.full((len(participants.scene),), -1, **INDICES)
+    assignment[participants.members] = group
+    return Merged(scene.to(device), assignment.to(device), size_change)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,12 +12,11 @@ from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
-from pointsplat_ns.looking.content import content_size, in_units, views_in_units
+from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.merging.covariance import covariances_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.pieces import CHUNK, in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.views import Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +38,6 @@ class Participants:
     def __len__(self) -> int:
         return len(self.members)
 
-    def in_units(self, scene: Gaussians) -> Gaussians:
-        """A scene in the units of this scene's content, see :func:`~pointsplat_ns.looking.content.in_units`."""
-        return in_units(scene, self.centre, self.size)
-
-    def views_in_units(self, views: Views) -> Views:
-        """Views of this scene in the same units."""
-        return views_in_units(views, self.centre, self.size)
-
 
 def drawable(scene: Gaussians, k: int) -> Tensor:
     """Ascending indices of the Gaussians that can be drawn; if they are fewer than ``k``, also of the most opaque ones
@@ -68,10 +58,6 @@ def drawable(scene: Gaussians, k: int) -> Tensor:
     return chosen.nonzero()[:, 0]
 
 
-OF_EACH = ("means", "cov", "alphas", "colours", "weights", "counts")
-"""Tensors of a state that have a row for each Gaussian."""
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """The Gaussians that remain after some rounds.
@@ -85,29 +71,15 @@ class State:
     colours: Tensor  # [n, C] float32 on principal axes, colour units
     weights: Tensor  # [n] float32, visibility weight per unit of area
     counts: Tensor  # [n] int32, number of Gaussians that each stands for
-    centre: Tensor  # [3] float64, of the scene
-    size: float
-    """Diagonal of the scene's content, scene units."""
 
     def __len__(self) -> int:
         return len(self.means)
-
-    def in_scene_units(self) -> tuple[Tensor, Tensor]:
-        """Means (n, 3) and covariances (n, 6) in scene units, float64."""
-        return self.means.double() * self.size + self.centre, self.cov.double() * self.size**2
-
-
-class ColourAxes(NamedTuple):
-    """Axes on which colours are compared."""
-
-    middle: Tensor  # [3 (d+1)^2] float32, mean of the coefficients, colour units
-    axes: Tensor  # [3 (d+1)^2, C] float32, orthogonal, each of length 1
 
 
 def initial_state(
     participants: Participants,
     weights: Tensor,
-    colour_axes: ColourAxes | None = None,
+    colour_axes: tuple[Tensor, Tensor] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> State:
     """The state before the first round.
@@ -115,7 +87,7 @@ def initial_state(
     Args:
         participants: n Gaussians of a scene.
         weights: (n,) visibility weight of each per unit of area.
-        colour_axes: by default the principal axes of the participants.
+        colour_axes: as of :func:`principal_axes`; by default those of the participants.
         dtype: float64 for a reference, which kernels do not take.
     """
     scene, members = participants.scene, participants.members
@@ -130,8 +102,6 @@ def initial_state(
         ),
         weights=weights.float(),
         counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
-        centre=centre,
-        size=size,
     )
 
 
@@ -146,9 +116,13 @@ def _coefficients(scene: Gaussians, rows: Tensor) -> Tensor:
     return bounded_colours(torch.cat(parts, dim=1))
 
 
-def principal_axes(scene: Gaussians, members: Tensor) -> ColourAxes:
-    """Principal axes of all SH coefficients of members (n,). By Parseval's theorem, the coefficients of every band
-    contribute to the mean square over directions as the constant does. Eight axes hold nearly all of the variance."""
+def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean of all SH coefficients of members (n,), (3 (d+1)^2,) float32, colour units, and their principal axes,
+    (3 (d+1)^2, C) float32, orthogonal, each of length 1.
+
+    By Parseval's theorem, the coefficients of every band contribute to the mean square over directions as the constant
+    does. Eight axes hold nearly all of the variance.
+    """
     pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
     shift = _coefficients(scene, pieces[0]).mean(0)  # near the mean, so that float32 holds the squares
@@ -159,5 +133,4 @@ def principal_axes(scene: Gaussians, members: Tensor) -> ColourAxes:
         products += values.T @ values
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
-    axes = torch.linalg.eigh(covariance).eigenvectors[:, -8:].float()
-    return ColourAxes((shift + mean).float(), axes)
+    return (shift + mean).float(), torch.linalg.eigh(covariance).eigenvectors[:, -8:].float()

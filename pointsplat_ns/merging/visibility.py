@@ -1,14 +1,10 @@
 """Visibility weight of each Gaussian: the pixels that it covers per unit of its own area. Errors count by it.
 
-The error that counts is per solid angle, not per squared metre, and only where something is seen. So both distance and
-occlusion matter, and a render measures both: a Gaussian covers the sum over pixels of its blend weight, alpha times
-transmittance. Divided by its opacity and area, that is large near the cameras, small far away, and 0 behind a wall.
+A Gaussian covers the sum over pixels of its blend weight, alpha times transmittance. Divided by its opacity and area,
+that is large near the cameras, small far away, and 0 behind a wall.
 
 Pictures are small. 3DGS rasterizers widen every projected Gaussian by 0.3 pixels, which would make Gaussians below the
 size of a pixel seem large. The antialiased rasterizer lowers their opacity by as much, so it counts right.
-
-Where traces in the scene show where its photos were taken, the weight is multiplied by the trace factor
-(:mod:`~pointsplat_ns.looking.traces`).
 """
 
 from __future__ import annotations
@@ -24,7 +20,7 @@ from torch import Tensor
 from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import every_nth
+from pointsplat_ns.looking.content import every_nth, in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
@@ -49,7 +45,8 @@ def views_and_weights(
         report: called with the share done.
 
     Returns:
-        No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
+        No views for a small scene without known ones, if nothing is visible, or if no view is asked for. Where traces
+        show where the scene's photos were taken, weights are multiplied by :mod:`~pointsplat_ns.looking.traces`.
     """
     found, photos_found = (views if isinstance(views, Views) else None), False
     if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:
@@ -58,26 +55,17 @@ def views_and_weights(
             found = sampler.views(settings.sampled_views, settings.view_seed)
             photos_found = sampler.photos is not None
     report(0.6)
-    weights = visibility_weights(participants, found, settings, lambda share: report(0.6 + 0.4 * share))
-    return found, weights * trace_factors(participants.scene, participants.members) if photos_found else weights
-
-
-def visibility_weights(
-    participants: Participants,
-    views: Views | None,
-    settings: MergeSettings,
-    report: Callable[[float], None] = lambda share: None,
-) -> Tensor:
-    """Weights of the participants, (n,) float32, up to a common factor; 1 for all without views. In a large scene, one
-    of several participants along the curve is drawn for all of them."""
     scene, members = participants.scene, participants.members
-    if views is None:
-        return torch.ones(len(members), **FLOATS)
-    step = -(-len(members) // settings.max_count_drawn)
-    rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
-    drawn = participants.in_units(scene if step == 1 else every_nth(scene, members, step))
-    weights = covered_per_area(drawn, rows, participants.views_in_units(views), settings, report)
-    return weights.repeat_interleave(step)[: len(members)]
+    weights = torch.ones(len(members), **FLOATS)
+    if found is not None:
+        step = -(-len(members) // settings.max_count_drawn)  # one of so many along the curve is drawn for all of them
+        rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
+        unit = participants.centre, participants.size
+        drawn = in_units(scene if step == 1 else every_nth(scene, members, step), *unit)
+        looks = views_in_units(found, *unit)
+        each = covered_per_area(drawn, rows, looks, settings, lambda share: report(0.6 + 0.4 * share))
+        weights = each.repeat_interleave(step)[: len(members)]
+    return found, weights * trace_factors(scene, members) if photos_found else weights
 
 
 def covered_per_area(

@@ -17,7 +17,7 @@ from pointsplat_ns.io.usable import keep_usable
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import Merger
 from pointsplat_ns.pruning import need_usable, resolve_keep, select
-from pointsplat_ns.pruning.coverage import coverage_score
+from pointsplat_ns.pruning.baselines import coverage_score
 
 
 @dataclass(eq=False)

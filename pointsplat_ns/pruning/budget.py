@@ -22,12 +22,11 @@ KEEP_FORMS = (
 
 @dataclass(frozen=True)
 class Megabytes:
-    """A budget: the largest size of the file, in units of 10^6 bytes. Raises BudgetError if it is not positive, or the
-    format is not written."""
+    """A budget: the largest size of a file in units of 10^6 bytes, by the suffix of its format. Raises BudgetError if
+    it is not positive, or the format is not written."""
 
     value: float
     suffix: str = ".ply"
-    """Suffix of the file format."""
 
     def __post_init__(self) -> None:
         kind = format_named(self.suffix)
@@ -38,7 +37,7 @@ class Megabytes:
 
     @property
     def bytes(self) -> int:
-        """The largest size, bytes."""
+        """The largest size."""
         return math.floor(self.value * 1e6)
 
     @property
@@ -52,12 +51,11 @@ class Megabytes:
 
 @dataclass(frozen=True)
 class WithinPsnr:
-    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own. Raises BudgetError
-    if it is not positive."""
+    """A budget: the smallest scene whose renders reach this PSNR (dB) against the dense scene's own, with numbers
+    rounded for the format with a suffix. Raises BudgetError if it is not positive."""
 
     value: float
     suffix: str = ".ply"
-    """Suffix of the file format, for which numbers are rounded."""
 
     def __post_init__(self) -> None:
         if not 0 < self.value < math.inf:  # NaN fails too
@@ -78,28 +76,23 @@ def resolve_keep(n: int, keep: Keep | str, sh_degree: int = 3, traits: Traits = 
     """The number of Gaussians that a budget means for a scene of ``n``.
 
     The type decides: a float is a ratio and an int is a count, so ``1.0`` keeps everything and ``1`` keeps one
-    Gaussian. A ratio gives the nearest count (a half is rounded up), and at least one. A count above ``n`` keeps all.
-    A size gives as many Gaussians as fit into the file.
+    Gaussian. A ratio gives the nearest count, and at least one. A size gives as many as fit into the file.
 
     Args:
         n: number of Gaussians in the scene.
-        keep: float ratio in (0, 1], int count from 1 on, :class:`Megabytes`, or any of them as :func:`parse_keep` reads
-            it.
-        sh_degree: SH degree of the scene that will be written; only a size depends on it.
-        traits: of the scene; only a size depends on them.
+        keep: float ratio in (0, 1], int count from 1 on, :class:`Megabytes`, or any of them as text.
+        sh_degree, traits: of the scene that will be written; only a size depends on them.
 
     Returns:
         The count, in 1..n.
 
     Raises:
-        BudgetError: if ``keep`` is out of range, NaN or not a number, if it can only be resolved by rendering
-            (:class:`WithinPsnr`) or by writing (the size of a compressed file), or if the scene is empty.
+        BudgetError: if ``keep`` is out of range, NaN or not a number, if it is :func:`found_by_trying`, or if the scene
+            is empty.
 
     Example:
-        >>> resolve_keep(1000, 0.3), resolve_keep(1000, 1), resolve_keep(1000, 1.0), resolve_keep(1000, "25%")
-        (300, 1, 1000, 250)
-        >>> resolve_keep(1000, 2000), resolve_keep(1000, Megabytes(0.1), sh_degree=0)
-        (1000, 1000)
+        >>> [resolve_keep(1000, keep) for keep in (0.3, 1, 1.0, "25%", 2000)]
+        [300, 1, 1000, 250, 1000]
     """
     if isinstance(keep, str):
         keep = parse_keep(keep)

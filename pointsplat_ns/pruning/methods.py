@@ -11,12 +11,10 @@ from torch import Tensor
 
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging import merge
-from pointsplat_ns.pruning.baselines import authors_score, opacity_score, random_score
+from pointsplat_ns.pruning.baselines import authors_score, coverage_score, opacity_score, random_score
 from pointsplat_ns.pruning.budget import Keep, resolve_keep
-from pointsplat_ns.pruning.coverage import coverage_score
 from pointsplat_ns.pruning.paper import paper_score, select
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, pup_score
 from pointsplat_ns.views import Views
@@ -66,12 +64,8 @@ def method_named(by: str, opacity_weight: float | None = None) -> Method:
 
 @dataclass(frozen=True)
 class PruneSettings:
-    """Pruning settings that apply to many scenes, as in training.
-
-    Raises:
-        PointSplatError: if there is no such method, it needs views, or it has no opacity weight but is given one.
-        BudgetError: if ``keep`` is neither a ratio nor a count.
-    """
+    """Pruning settings that apply to many scenes, as in training. Raises BudgetError if ``keep`` is neither a ratio nor
+    a count, and PointSplatError if the method needs views, or for what :func:`method_named` refuses."""
 
     keep: float | int
     """Ratio (float, at most 1) or count (int)."""
@@ -100,7 +94,7 @@ def prune(
     scene: Gaussians,
     keep: Keep | str,
     by: str = "merge",
-    views: Views | Sampler | Callable[[], Views] | None = None,
+    views: Views | Sampler | None = None,
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Gaussians:
@@ -110,8 +104,7 @@ def prune(
         scene: N Gaussians.
         keep: ratio, count or size (see :func:`~pointsplat_ns.pruning.budget.resolve_keep`).
         by: one of :data:`METHODS`. Methods with a score keep Gaussians unchanged, in their original order.
-        views: views for methods that need them, or a function that returns them. Merging uses views or a sampler; for
-            a function or None it samples views of its own.
+        views: views for methods that need them. Merging uses views or a sampler; for None it samples views of its own.
         opacity_weight: lambda of the methods that weigh opacity; by default the paper's.
         progress: called with the share done, in [0, 1].
 
@@ -128,9 +121,7 @@ def prune(
     count = resolve_keep(len(scene), keep, scene.sh_degree, scene.traits)
     need_usable(scene)
     if method.score is None:
-        merged = merge(scene, count, progress, views if isinstance(views, (Views, Sampler)) else None)
-        logger.debug("%s", merged.finish.note)
-        return merged.scene
+        return merge(scene, count, progress, views).scene
     given = None if isinstance(views, Sampler) else views
     return scene[select(score_of(scene, method, given, opacity_weight, progress), count)]
 
@@ -143,7 +134,8 @@ def score_of(
     opacity_weight: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Tensor:
-    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`."""
+    """Scores (N,) float64 of a scene by a method that has a score; arguments as for :func:`prune`, and ``views`` may be
+    a function that returns them."""
     assert method.score is not None, f"{method.name} has no score"
     if method.needs_views:
         if views is None:

@@ -37,7 +37,7 @@ def paper_score(scene: Gaussians, opacity_weight: float = DEFAULT_OPACITY_WEIGHT
     Raises:
         ScoreError: if ``opacity_weight`` is not in [0, 1].
     """
-    return weighted_score(scene, opacity_weight, opacity, _relative_volume)
+    return weighted_score(scene, opacity_weight, lambda part: part.opacities[:, 0].double().sigmoid(), _relative_volume)
 
 
 def weighted_score(
@@ -66,11 +66,6 @@ def zscore(values: Tensor) -> Tensor:
     return centred / centred.square().mean().sqrt()
 
 
-def opacity(scene: Gaussians) -> Tensor:
-    """The paper's alpha, in [0, 1], (N,) float64."""
-    return torch.sigmoid(scene.opacities[:, 0].double())
-
-
 def log_volume(scene: Gaussians) -> Tensor:
     """Natural logarithm of 4/3 pi sx sy sz, cubic scene units, (N,) float64; -Inf for a flat Gaussian."""
     return scene.scales.double().sum(dim=1) + math.log(4 / 3 * math.pi)
@@ -93,16 +88,9 @@ def of_usable(scene: Gaussians, score: Callable[[Gaussians], Tensor]) -> Tensor:
 
 
 def select(scores: Tensor, k: int) -> Tensor:
-    """Indices of the ``k`` highest scores: exactly K Gaussians.
+    """Indices (k,) int64, ascending, of the ``k`` highest scores (N,), of any floating type, +-Inf allowed.
 
     Of equal scores, the lower index is taken first; NaN ranks below every number.
-
-    Args:
-        scores: (N,), any floating type; +-Inf allowed.
-        k: number of indices, 0 to N.
-
-    Returns:
-        Indices (k,) int64, ascending.
 
     Raises:
         BudgetError: if ``k`` is not in 0..N.

@@ -1,10 +1,8 @@
 """Cutting the bands of spherical harmonics (SH), and the energy that is lost by it.
 
 The basis is orthonormal on the sphere: the mean square, over all directions, of a coefficient's contribution to a
-colour is its square divided by 4 pi, and dropping coefficients is the best approximation by the others. So the energy
-lost is known without rendering. The visible error is not: a scene is seen from some directions only, and errors of real
-scenes were up to 9 dB away from the energy's prediction. So :mod:`~pointsplat_ns.compression.prune` renders to
-decide which degree to keep.
+colour is its square divided by 4 pi. So the energy lost is known without rendering. The visible error is not, as a
+scene is seen from some directions only: it was up to 9 dB away from the energy's prediction.
 """
 
 from __future__ import annotations
@@ -14,8 +12,7 @@ import math
 import torch
 import torch.nn.functional as F
 
-from pointsplat_ns.errors import BudgetError
-from pointsplat_ns.gaussians import MAX_SH_DEGREE, Gaussians
+from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.baselines import log_area
 
 
@@ -35,30 +32,13 @@ def band_energies(scene: Gaussians) -> list[float]:
 
 
 def energy_lost(scene: Gaussians, degree: int) -> float:
-    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to an SH degree.
-
-    Returns:
-        In [0, 1]; 0 if there is none to lose.
-
-    Raises:
-        BudgetError: if the degree is not 0 to 3.
-    """
-    _check(degree)
+    """Share of the view-dependent energy (:func:`band_energies`) that is lost if a scene is cut to an SH degree, in
+    [0, 1]; 0 if there is none to lose."""
     energies = band_energies(scene)
     total = sum(energies)
     return sum(energies[degree:]) / total if total > 0 else 0.0
 
 
 def cut_sh(scene: Gaussians, degree: int) -> Gaussians:
-    """The scene without SH bands above ``degree``; all other values are unchanged.
-
-    Raises:
-        BudgetError: if the degree is not 0 to 3.
-    """
-    _check(degree)
+    """The scene without SH bands above ``degree``; all other values are unchanged."""
     return scene.replace(features_rest=scene.features_rest[:, : (degree + 1) ** 2 - 1])
-
-
-def _check(degree: int) -> None:
-    if not 0 <= degree <= MAX_SH_DEGREE:
-        raise BudgetError(f"SH degree is {degree}; expected 0 to {MAX_SH_DEGREE}")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.pruning.paper import ScoreError, log_volume
+from pointsplat_ns.pruning.paper import log_volume
 from pointsplat_ns.rasterizer.pixel_walk import PixelBlock, sum_over_pixels
 from pointsplat_ns.rasterizer.projection import Projected, project_scene
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
@@ -21,31 +21,24 @@ from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import View, Views
 
 
-def lightgaussian_score(
-    scene: Gaussians, views: Views, beta: float = 0.1, progress: Callable[[float], None] | None = None
-) -> Tensor:
+def lightgaussian_score(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
     """LightGaussian's global significance (arXiv 2311.17245, eq. 3 and 4).
 
-    ``sum over all pixels of 1(hit) * opacity * T``, times ``min(V / V_90, 1) ** beta``: T is the
+    ``sum over all pixels of 1(hit) * opacity * T``, times ``min(V / V_90, 1) ** 0.1``: T is the
     transmittance in front of the Gaussian at that pixel, V its volume, and V_90 the volume at 90 % of
     all volumes in descending order. The authors' released code leaves out T and the clamp at 1.
 
     Args:
         scene: N Gaussians.
         views: at least one view.
-        beta: exponent of the volume, at least 0 (section 3.2).
         progress: called with the share done, in [0, 1].
 
     Returns:
         Scores (N,), float64; zero where no view sees the Gaussian, NaN where it cannot be drawn.
 
     Raises:
-        ScoreError: if ``beta`` is negative or not a number.
         DataError: if there is no view.
     """
-    if not (0 <= beta < math.inf):
-        raise ScoreError(f"beta is {beta}; expected 0 or more")
-    _need_a_view(views)
     usable = scene.usable()
     scene = scene.to(torch.promote_types(scene.dtype, torch.float32))  # as the rasterizer does
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
@@ -63,7 +56,7 @@ def lightgaussian_score(
             ranked = logs[usable].sort(descending=True).values
             relative = logs - ranked[min(int(0.9 * len(ranked)), len(ranked) - 1)]
             # -Inf - -Inf is NaN: a flat Gaussian among flat ones has a relative volume of 1
-            total *= torch.exp(beta * relative.nan_to_num(nan=0.0, posinf=0.0).clamp_max(0.0))
+            total *= torch.exp(0.1 * relative.nan_to_num(nan=0.0, posinf=0.0).clamp_max(0.0))
     return torch.where(usable, total, math.nan)
 
 
@@ -72,9 +65,8 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 
     ``log det H`` with ``H = sum over views, pixels and channels of g g^T``, the Gauss-Newton Hessian of the
     squared error of the picture, where g is the gradient of a pixel's channel by the mean (3) and the
-    log-scales (3) of the Gaussian, as in the authors' released code. By standard deviations the score would be lower
-    by ``2 sum(log-scale)``, which favours small Gaussians. It is exact and includes the change of colour with the
-    viewing direction; values clamped at black or at the maximum of alpha have no gradient. The authors take the
+    log-scales (3) of the Gaussian, as in the authors' released code. It is exact and includes the change of colour with
+    the viewing direction; values clamped at black or at the maximum of alpha have no gradient. The authors take the
     picture at a quarter of its width; here the views' own size counts.
 
     Args:
@@ -96,7 +88,6 @@ def pup_score(scene: Gaussians, views: Views, progress: Callable[[float], None] 
 def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None] | None = None) -> Tensor:
     """The 6 x 6 Hessian blocks of :func:`pup_score`, (N, 6, 6) float64: by the mean (world, scene units), then by the
     log-scales."""
-    _need_a_view(views)
     # In float32, small eigenvalues, and so the scores of Gaussians that few pixels show, are rounding errors. In a room
     # a quarter of the better half differed from float64.
     scene = scene.to(torch.float64).detach()
@@ -119,12 +110,12 @@ def sensitivity(scene: Gaussians, views: Views, progress: Callable[[float], None
     return total
 
 
-def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
+def log_determinant(blocks: Tensor) -> Tensor:
     """Logarithm of the determinants of symmetric positive semi-definite blocks, (N, D, D) to (N,); -Inf where the
     diagonal has a zero.
 
     Each block is first scaled to a unit diagonal, so that neither 1e-30 nor 1e30 under- or overflows. Its eigenvalues
-    count as at least ``least``: parameters that no view determines have eigenvalues of 0, whose computed values and
+    count as at least 1e-9: parameters that no view determines have eigenvalues of 0, whose computed values and
     logarithms are rounding errors. So the result depends on the other eigenvalues.
     """
     diagonal = blocks.diagonal(dim1=-2, dim2=-1)
@@ -133,7 +124,7 @@ def log_determinant(blocks: Tensor, least: float = 1e-9) -> Tensor:
     unit = torch.where(ok[:, None, None], blocks, torch.eye(blocks.shape[-1], **FLOATS).to(blocks))
     # on the CPU: what torch's linear algebra on a GPU is made of differs between machines
     values = torch.linalg.eigvalsh((unit / root[:, :, None] / root[:, None, :]).cpu()).to(root.device)
-    result = values.clamp_min(least).log().sum(-1) + 2 * root.log().sum(-1)
+    result = values.clamp_min(1e-9).log().sum(-1) + 2 * root.log().sum(-1)
     return torch.where(ok, result, -math.inf)
 
 
@@ -145,17 +136,8 @@ def _second_moments(projected: Projected, colors: Tensor, view: View) -> Tensor:
     def values(block: PixelBlock) -> Tensor:
         weight = block.alpha * block.before  # (B, L, 64)
         shade = colors[block.ids]  # (B, L, 3)
-        phi = torch.stack(
-            [
-                torch.ones_like(weight),
-                block.gx,
-                block.gy,
-                0.5 * block.gx * block.gx,
-                block.gx * block.gy,
-                0.5 * block.gy * block.gy,
-            ],
-            dim=-2,
-        )  # (B, L, 6, 64)
+        x, y = block.gx, block.gy
+        phi = torch.stack([torch.ones_like(weight), x, y, 0.5 * x * x, x * y, 0.5 * y * y], dim=-2)  # (B, L, 6, 64)
         steep = block.alpha / (1 - block.alpha)
         square = torch.zeros_like(weight)
         cross = []
@@ -183,13 +165,10 @@ def _jacobian(outputs: Tensor, means: Tensor, scales: Tensor, ids: Tensor) -> Te
     return torch.stack(rows, dim=1).double()
 
 
-def _need_a_view(views: Views) -> None:
+def _each(views: Views, progress: Callable[[float], None] | None) -> Iterator[View]:
+    """The views, at least one; calls ``progress`` after each with the share done."""
     if len(views) == 0:
         raise DataError("no view to score from; expected at least one pose")
-
-
-def _each(views: Views, progress: Callable[[float], None] | None) -> Iterator[View]:
-    """The views; calls ``progress`` after each with the share done."""
     for done, view in enumerate(views, 1):
         yield view
         if progress is not None:

@@ -12,7 +12,7 @@ from pointsplat_ns.gaussians import MAX_SH_DEGREE
 
 _NAMES = {
     "encoder": ("dual", "concat"),
-    "norm": ("scene", "batch", "layer"),
+    "norm": ("scene", "batch"),
     "stem": ("conv", "linear"),
     "curves": ("z", "z-trans", "hilbert", "hilbert-trans"),
 }
@@ -34,9 +34,8 @@ class RefinerConfigError(PointSplatError, ValueError):
 class RefinerConfig:
     """All settings of a refiner's network.
 
-    The defaults are the preset ``full``, the published network. Tuples of the encoder have one entry per stage;
-    ``strides`` and the tuples of the decoder have one entry fewer, finest first. Raises RefinerConfigError if the
-    fields contradict one another.
+    The defaults are the preset ``full``, the published network. Tuples of the encoder have one entry per stage, finest
+    first; ``strides`` and the tuples of the decoder one fewer. Raises RefinerConfigError if fields contradict others.
     """
 
     sh_degree: int = MAX_SH_DEGREE
@@ -44,21 +43,18 @@ class RefinerConfig:
     encoder: Literal["dual", "concat"] = "dual"
     """``dual`` gates geometry by appearance (paper eq. 4 to 6); ``concat`` is one concatenated vector (SplatFormer)."""
     use_appearance: bool = True
-    """Gate the geometry by the appearance branch (Table 4, column f^(a)); dual encoder only."""
     use_position: bool = True
-    """Add the position encoding to both branches (Table 4, column delta); dual encoder only."""
+    """Gate the geometry by the appearance branch, and add the position encoding to both branches (Table 4, columns
+    f^(a) and delta); dual encoder only."""
     feature_dim: int = 32
     """Channels of each encoder branch."""
     unit_gate: bool = False
-    """Multiply the softmax gate by its number of channels, so that gates average 1 and not 1/32. The next layer could
-    learn this factor, but training is faster with it."""
+    """Multiply the softmax gate by its number of channels, so that gates average 1: training is faster."""
     color_hidden: int = 32
-    """Hidden channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     color_dim: int = 8
-    """Output channels of that MLP."""
+    """Hidden and output channels of the MLP that reduces the SH coefficients of degree 1 and higher."""
     raw_inputs: bool = False
-    """Give the encoder log-scales in units of the cube and opacity logits as they are. By default both are brought to
-    order 1, which softens the imbalance of one concatenated vector."""
+    """Give the encoder log-scales in units of the cube and opacity logits as they are, not brought to order 1."""
     stem: Literal["conv", "linear"] = "conv"
     """First layer of the backbone, before its norm and GELU: a 3x3x3 convolution, or a linear layer of each point (the
     published code)."""
@@ -67,17 +63,13 @@ class RefinerConfig:
     strides: tuple[int, ...] = (1, 2, 2, 2)
     """Growth of the cells from stage to stage, powers of two; 1 only merges points that share a cell."""
     enc_channels: tuple[int, ...] = (64, 96, 128, 256, 512)
-    """Channels of each encoder stage."""
     enc_depths: tuple[int, ...] = (2, 2, 2, 4, 2)
-    """Blocks in each encoder stage."""
     enc_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
-    """Attention heads in each encoder stage."""
+    """Channels, blocks and attention heads of each encoder stage."""
     dec_channels: tuple[int, ...] = (96, 96, 128, 256)
-    """Channels of each decoder stage, finest first."""
     dec_depths: tuple[int, ...] = (2, 2, 2, 2)
-    """Blocks in each decoder stage, finest first."""
     dec_heads: tuple[int, ...] = (4, 4, 4, 4)
-    """Attention heads in each decoder stage, finest first."""
+    """Channels, blocks and attention heads of each decoder stage."""
     patch: int = 1024
     """Number of points in an attention patch."""
     mlp_ratio: int = 4
@@ -86,15 +78,12 @@ class RefinerConfig:
     """Probability of dropping the deepest block's branch for a point in training; shallower blocks have less."""
     curves: tuple[str, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
     """Serialization curves; block i of a stage uses curve i (shuffled in training). Memory is laid out by the first."""
-    norm: Literal["scene", "batch", "layer"] = "scene"
-    """Normalisation outside the attention blocks. ``scene`` takes each channel's mean and variance over the points of
-    the current scene, in training and in evaluation. In training the published ``batch`` does the same, as a step sees
-    one scene; but in evaluation it uses running averages over scenes, which fit no single scene. ``layer`` normalises
-    each point by itself."""
+    norm: Literal["scene", "batch"] = "scene"
+    """Normalisation outside the attention blocks, by each channel's mean and variance over the points of the current
+    scene. In evaluation the published ``batch`` uses running averages over scenes, which fit no single scene."""
     head_width: int = 128
-    """Hidden width of the output heads."""
     head_depth: int = 4
-    """Linear layers of each output head."""
+    """Hidden width and number of linear layers of each output head."""
     means_reach: float = 0.05
     """Largest move of a mean along an axis, as a share of the scene's extent (1.0 in the published code)."""
 
@@ -103,7 +92,7 @@ class RefinerConfig:
             value = getattr(self, field.name)
             value = tuple(value) if isinstance(value, list) else value
             setattr(self, field.name, value)
-            _check_type(field.name, str(field.type), value)
+            _check(field.name, str(field.type), value)
         stages = len(self.enc_channels)
         _require(stages >= 1, "enc_channels is empty; expected one entry per stage")
         for name in ("enc_depths", "enc_heads", "strides", "dec_channels", "dec_depths", "dec_heads"):
@@ -114,17 +103,11 @@ class RefinerConfig:
                 _require(c % h == 0, f"{part}: {c} channels do not divide into {h} heads")
         for s in self.strides:
             _require(s & (s - 1) == 0, f"strides holds {s}; expected powers of two")
-        for name, known in _NAMES.items():
-            value = getattr(self, name)
-            fits = bool(value) and set(value if isinstance(value, tuple) else [value]) <= set(known)
-            _require(fits, f"{name} is {value!r}; expected {', '.join(known)}")
+        _require(bool(self.curves), f"curves is (); expected {', '.join(_NAMES['curves'])}")
         _require(
             self.encoder == "dual" or (self.use_appearance and self.use_position),
             "use_appearance and use_position are switches of the encoder 'dual'; encoder 'concat' expects both on",
         )
-        for name, (least, most) in _RANGES.items():
-            value = getattr(self, name)
-            _require(value is None or least <= value <= most, f"{name} is {value}; expected {least} to {most}")
 
     @property
     def num_rest(self) -> int:
@@ -144,34 +127,28 @@ class RefinerConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RefinerConfig:
         """The configuration of a file. Raises RefinerConfigError if a field is unknown or fields contradict others."""
-        fields = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - fields)
+        unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
         _require(not unknown, f"unknown refiner settings {', '.join(unknown)}; a newer version may have written them")
-        try:
-            return cls(**values)
-        except TypeError as error:
-            raise RefinerConfigError(f"refiner settings of the wrong type: {error}") from error
+        return cls(**values)
 
 
-def _check_type(name: str, kind: str, value: Any) -> None:
-    """Check the type of a setting against its annotation, and whole numbers against their range."""
-    if kind.startswith("Literal") or kind == "tuple[str, ...]":
-        texts = value if isinstance(value, tuple) else (value,)
-        _require(all(isinstance(text, str) for text in texts), f"{name} is {value!r}; expected text")
+def _check(name: str, kind: str, value: Any) -> None:
+    """Check a setting, which files may hold anything for, against its annotation, its names and its range."""
+    if value is None and "None" in kind:
+        return
+    parts = value if isinstance(value, tuple) else (value,)
+    if name in _NAMES:
+        fits, expected = all(part in _NAMES[name] for part in parts), ", ".join(_NAMES[name])
     elif kind == "bool":
-        _require(isinstance(value, bool), f"{name} is {value!r}; expected true or false")
-    elif kind == "float":
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        _require(number, f"{name} is {value!r}; expected a number")
-    elif value is not None or "None" not in kind:
-        numbers = value if kind == "tuple[int, ...]" else (value,)
-        least, most = 0 if name == "sh_degree" else 1, 1 << 16  # the published network has 1024 at most
-        whole = isinstance(numbers, tuple) and all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
-        _require(
-            whole and all(least <= n <= most for n in numbers),
-            f"{name} is {reprlib.repr(value)}; expected {'whole numbers' if kind != 'int' else 'a whole number'} of "
-            f"{least} to {most}",
-        )
+        fits, expected = isinstance(value, bool), "true or false"
+    else:
+        least, most = _RANGES.get(name, (1, 1 << 16))  # the published network has 1024 at most
+        types: Any = (int, float) if kind == "float" else int
+        # NaN is in no range
+        fits = all(isinstance(n, types) and not isinstance(n, bool) and least <= n <= most for n in parts)
+        expected = f"{'numbers' if kind == 'float' else 'whole numbers'} from {least} to {most}"
+    of_its_kind = isinstance(value, tuple) == kind.startswith("tuple")
+    _require(fits and of_its_kind, f"{name} is {reprlib.repr(value)}; expected {expected}")
 
 
 def _require(condition: bool, message: str) -> None:

@@ -24,9 +24,6 @@ from pointsplat_ns.refiner.weights import checked_tensors, opened_weights
 
 FEEDBACK_FORMAT = "pointsplat-feedback/2"
 
-SHIPPED_FEEDBACK = Path(__file__).parent / "pretrained" / "feedback.safetensors"
-"""The shipped network; ``CARD.md`` beside it describes its training and results."""
-
 
 class FeedbackRefiner(nn.Module):
     """An MLP on the features of each Gaussian.
@@ -61,16 +58,16 @@ def save_feedback_refiner(network: FeedbackRefiner, path: Path | str, metadata: 
     write_tensors(path, network.state_dict(), {"format": FEEDBACK_FORMAT, "metadata": json.dumps(metadata or {})})
 
 
-def read_feedback_refiner(path: Path | str = SHIPPED_FEEDBACK, device: torch.device | str = "cpu") -> FeedbackRefiner:
-    """Read a network, in evaluation mode; by default the shipped one. Raises WeightsError if the file is none."""
+@lru_cache(maxsize=2)
+def shipped_feedback_refiner(device: torch.device) -> FeedbackRefiner:
+    """The shipped network on a device; ``pretrained/FEEDBACK.md`` describes its training and results."""
+    return read_feedback_refiner(Path(__file__).parent / "pretrained" / "feedback.safetensors").to(device)
+
+
+def read_feedback_refiner(path: Path | str) -> FeedbackRefiner:
+    """Read a network, in evaluation mode. Raises WeightsError if the file is none."""
     path, network = Path(path), FeedbackRefiner()
     with opened_weights(path, FEEDBACK_FORMAT, "a feedback refiner") as (file, _):
         state = checked_tensors(file, network.state_dict(), path)
     network.load_state_dict(state)
-    return network.to(device).eval().requires_grad_(requires_grad=False)
-
-
-@lru_cache(maxsize=2)
-def shipped_feedback_refiner(device: torch.device) -> FeedbackRefiner:
-    """The shipped network, read once for each device."""
-    return read_feedback_refiner(device=device)
+    return network.eval().requires_grad_(requires_grad=False)

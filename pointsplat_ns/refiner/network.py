@@ -74,8 +74,7 @@ class BatchNorm(nn.BatchNorm1d):
 class SceneNorm(nn.Module):
     """Normalises each channel over the points of the current scene: ``[N, C] -> [N, C]``.
 
-    As batch norm in training, but also in evaluation: there are no running statistics. A single point, which has no
-    variance, is its own mean.
+    There are no running statistics. A single point, which has no variance, is its own mean.
     """
 
     def __init__(self, channels: int):
@@ -90,7 +89,7 @@ class SceneNorm(nn.Module):
             return F.batch_norm(x, None, None, self.weight, self.bias, True, 0.0, 1e-3)
 
 
-NORMS: dict[str, Callable[[int], nn.Module]] = {"scene": SceneNorm, "batch": BatchNorm, "layer": layer_norm}
+NORMS: dict[str, type[nn.Module]] = {"scene": SceneNorm, "batch": BatchNorm}
 """By the names of ``RefinerConfig.norm``."""
 
 
@@ -334,17 +333,10 @@ class ResidualHeads(nn.Module):
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         """Residuals by attribute: ``[N, Cin] -> {name: [N, size]}``."""
-        rows = 4096  # at a time on a CPU, so that hidden layers fit into its cache: a quarter faster
-        if x.device.type != "cpu" or len(x) <= rows:
-            return self._forward(x)
-        parts = [self._forward(part) for part in x.split(rows)]
-        return {name: torch.cat([part[name] for part in parts]) for name in self.mlps}
-
-    def _forward(self, x: Tensor) -> dict[str, Tensor]:
         out = {}
         for name, mlp in self.mlps.items():
             # The rounding of a matrix times one column depends on the number of threads.
             with one_thread() if name == "opacities" else nullcontext():
-                residual = mlp(x)
+                residual = by_rows(mlp, x, 4096)  # so that hidden layers fit into the cache: a quarter faster
             out[name] = residual.tanh() * self.means_reach if name == "means" else residual
         return out

@@ -85,19 +85,13 @@ class Refiner(nn.Module):
                 f"structure of {structure.total} Gaussians and settings {structure.built_for} given for "
                 f"{len(scene)} Gaussians and settings {structure_key(self.config)}; call prepare(scene) again"
             )
-        if structure.usable is None:
-            return self._refine(scene, structure)
-        return _put_back(self._refine(scene[structure.usable], structure), structure.usable, scene)
-
-    def _refine(self, scene: Gaussians, structure: Structure) -> Gaussians:
-        """The refined scene of usable Gaussians."""
-        features = gaussian_features(
-            scene, structure.cube, self.config.num_rest, self.dtype, raw=self.config.raw_inputs
-        )
-        refined = _moved(scene, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
-        if self.training or (sound := refined.usable()).all():
-            return refined
-        return _put_back(refined[sound], sound, scene)
+        some = scene if structure.usable is None else scene[structure.usable]
+        raw = self.config.raw_inputs
+        features = gaussian_features(some, structure.cube, self.config.num_rest, self.dtype, raw)
+        refined = _moved(some, self.residuals(features, structure), features.quat_scale, structure.cube.extent)
+        if not self.training and not (sound := refined.usable()).all():
+            refined = _put_back(refined[sound], sound, some)
+        return refined if structure.usable is None else _put_back(refined, structure.usable, scene)
 
     def residuals(self, features: Features, structure: Structure) -> dict[str, Tensor]:
         """Residuals by attribute, in the network's units and the scene's order. # {name: [N, size]}"""
@@ -142,14 +136,13 @@ def gaussian_features(
     """Network input of a scene of N usable Gaussians, with its unit cube, for so many SH coefficients of degree 1 and
     higher a colour channel, in the network's floating type.
 
-    Positions are centred and divided by one extent, which keeps the aspect ratio; log-scales are shifted by the
-    logarithm of that extent. So the input does not depend on the scene's unit and position. Only the input is clamped:
-    residuals are added to the original parameters. Trained weights depend on these units and limits. With ``raw``,
-    log-scales in units of the cube and logits are clamped alike, but neither shifted nor scaled to order 1.
+    The input does not depend on the scene's unit and position. Only the input is clamped: residuals are added to the
+    original parameters. Trained weights depend on these units and limits. With ``raw``, log-scales in units of the cube
+    and logits are clamped alike, but neither shifted nor scaled to order 1.
     """
     # -5 is a typical log-scale in the unit cube: 4 cm in a room of 6 m
     centre, spread, logit_spread = (0.0, 1.0, 1.0) if raw else (-5.0, 2.0, 4.0)
-    log_scales = (cube.log_scales(scene.scales) - centre) / spread
+    log_scales = (scene.scales.double() - cube.extent.log() - centre) / spread
     low, high = ((bound - centre) / spread for bound in (-17.0, 7.0))
     logits = scene.opacities.clamp(-12.0, 12.0) / logit_spread  # beyond 12, opacity is 0 or 1 within 1e-5
     sh_limit = 8.0  # displayable colours need at most 1.8
@@ -169,10 +162,9 @@ def gaussian_features(
 def canonical_quats(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Unit quaternions (N, 4) of one sign, and their signed lengths (N, 1), of finite wxyz of any length.
 
-    A quaternion and its negative are the same rotation; the first non-zero component of the result is positive.
-    Quaternions shorter than :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of
-    1. Components are divided by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not
-    overflow.
+    The first non-zero component of the result is positive. Quaternions shorter than
+    :data:`~pointsplat_ns.geometry.transforms.SHORTEST` become the identity, with a length of 1. Components are divided
+    by the largest before squaring, so that 1e-30 does not underflow and 1e30 does not overflow.
     """
     quats = zero_as_identity(quats)
     largest = quats.abs().amax(dim=1, keepdim=True).detach()

@@ -1,6 +1,6 @@
 """The sparse operations of the network: permutation, maximum and mean per cluster, submanifold convolution, pieces.
 
-The first, second and fourth have their own backward. Autograd's backward of a gather accumulates row by row; for a
+The first and the fourth have their own backward. Autograd's backward of a gather accumulates row by row; for a
 permutation or distinct targets a gather is enough. No function allocates more than a few times [N, C].
 """
 
@@ -42,30 +42,14 @@ def permute(
     return _Permute.apply(x, order, inverse)
 
 
-class _SegmentMax(Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, cluster: Tensor, size: int) -> Tensor:
-        index = cluster[:, None].expand_as(x)
-        top = x.new_empty(size, x.shape[1]).scatter_reduce_(0, index, x, "amax", include_self=False)
-        ctx.save_for_backward(x, cluster, top)
-        return top
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad: Tensor):
-        x, cluster, top = ctx.saved_tensors
-        is_top = (x == top.index_select(0, cluster)).to(x.dtype)
-        ties = torch.zeros_like(top).index_add_(0, cluster, is_top)
-        return is_top * (grad / ties.clamp_min_(1)).index_select(0, cluster), None, None
-
-
 def segment_max(
     x: Tensor,  # [N, C]
     cluster: Tensor,  # [N] int64 in [0, size), each value at least once
     size: int,
 ) -> Tensor:
     """Maximum over the rows of each cluster; the gradient of a tie is divided evenly. # [size, C]"""
-    return _SegmentMax.apply(x, cluster, size)
+    index = cluster[:, None].expand_as(x)
+    return x.new_zeros(size, x.shape[1]).scatter_reduce(0, index, x, "amax", include_self=False)
 
 
 class _SubmanifoldConv(Function):
@@ -145,14 +129,7 @@ def by_rows(
     """``function(x)``, on a CPU computed from ``rows`` rows at a time. # [N, Cout]"""
     if x.device.type != "cpu" or len(x) <= rows:
         return function(x)
-    if torch.is_grad_enabled():
-        return torch.cat([function(part) for part in x.split(rows)])
-    first = function(x[:rows])
-    out = first.new_empty(len(x), *first.shape[1:])
-    out[:rows] = first
-    for start in range(rows, len(x), rows):
-        out[start : start + rows] = function(x[start : start + rows])
-    return out
+    return torch.cat([function(part) for part in x.split(rows)])
 
 
 def by_patches(

@@ -1,8 +1,7 @@
 """Where the Gaussians of a scene are: its unit cube, and the grids and curves by which the network finds neighbours.
 
-All of it follows from positions alone. It is built once for a scene and used at every step. Points are stored along the
-first curve of the configuration, so that the points of a cell are consecutive at every level, and neighbours are close
-in memory.
+All of it follows from positions alone. Points are stored along the first curve of the configuration, so that the points
+of a cell are consecutive at every level, and neighbours are close in memory.
 """
 
 from __future__ import annotations
@@ -34,10 +33,6 @@ class UnitCube:
     def positions(self, means: Tensor) -> Tensor:
         """Positions in [-0.5, 0.5], float64; those outside the cube are clamped to it. # [N, 3]"""
         return ((means.double() - self.centre) / self.extent).clamp(-0.5, 0.5)
-
-    def log_scales(self, scales: Tensor) -> Tensor:
-        """Log-scales in units of the cube, in float64. # [N, 3]"""
-        return scales.double() - self.extent.log()
 
 
 def unit_cube(means: Tensor) -> UnitCube:
@@ -135,7 +130,7 @@ class Structure:
     order: Tensor  # [N] scene index of the point at each place in memory
     inverse: Tensor  # [N] place in memory of each Gaussian of the scene
     levels: list[GridLevel]
-    built_for: tuple  # :func:`structure_key` of its configuration
+    built_for: tuple  # the settings that it depends on, :func:`structure_key` of its configuration
     usable: Tensor | None = None  # [T] mask of the N Gaussians in the structure; None: all
 
     @property

@@ -44,7 +44,22 @@ def read_refiner(path: str | Path, device: torch.device | str = "cpu") -> Refine
     """
     path = Path(path)
     with opened_weights(path, REFINER_FORMAT, "refiner weights") as (file, header):
-        refiner = _hollow(header, len(file.keys()), path)
+        if "config" not in header:
+            raise WeightsError(
+                f"{path}: lacks the entry 'config'; expected refiner weights, as save_refiner writes them"
+            )
+        try:
+            config = RefinerConfig.from_dict(_json(header, "config", path))
+        except RefinerConfigError as error:
+            raise WeightsError(
+                f"{path}: configuration not understood ({one_line(error)}); train or download it again"
+            ) from error
+        tensors, layers = len(file.keys()), sum(config.enc_depths) + sum(config.dec_depths) + config.head_depth
+        if layers > tensors:
+            raise WeightsError(
+                f"{path}: {tensors} tensors for {layers} layers; the file is damaged or of another version"
+            )
+        refiner = Refiner(config, device="meta")  # shapes that take no memory
         state = checked_tensors(file, refiner.state_dict(), path)
     refiner.to_empty(device="cpu").load_state_dict(state)
     return refiner.to(device).eval()
@@ -107,27 +122,9 @@ def _json(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
         value = json.loads(header.get(key, "{}"))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: {key} is not JSON ({one_line(error)}); train or download it again") from error
-    if not isinstance(value, dict):
-        raise WeightsError(
-            f"{path}: {key} is {type(value).__name__}; expected a JSON object; train or download it again"
-        )
-    return value
-
-
-def _hollow(header: dict[str, str], tensors: int, path: Path) -> Refiner:
-    """The network of a file's configuration; its parameters have shapes but take no memory."""
-    if "config" not in header:
-        raise WeightsError(f"{path}: lacks the entry 'config'; expected refiner weights, as save_refiner writes them")
-    try:
-        config = RefinerConfig.from_dict(_json(header, "config", path))
-    except RefinerConfigError as error:
-        raise WeightsError(
-            f"{path}: configuration not understood ({one_line(error)}); train or download it again"
-        ) from error
-    layers = sum(config.enc_depths) + sum(config.dec_depths) + config.head_depth
-    if layers > tensors:
-        raise WeightsError(f"{path}: {tensors} tensors for {layers} layers; the file is damaged or of another version")
-    return Refiner(config, device="meta")
+    if isinstance(value, dict):
+        return value
+    raise WeightsError(f"{path}: {key} is {type(value).__name__}; expected a JSON object; train or download it again")
 
 
 def _shape(tensors: dict[str, Any], name: str) -> tuple[int, ...] | str:

@@ -1,4 +1,4 @@
-"""Merging cell by cell: the count, the seams, kills, and what is the same as in memory."""
+"""Merging cell by cell: the count, the seams, damaged steps, and what is the same as in memory."""
 
 import subprocess
 import sys
@@ -117,7 +117,7 @@ def test_other_work_begins_anew_and_damaged_steps_are_told(tmp_path):
 def test_gaussians_that_cannot_be_drawn_are_dropped_and_counted_once(tmp_path, caplog):
     scene = cloud(2000, seed=1)
     scene.means[::10] = torch.nan
-    write_all(scene, tmp_path / "scene.ply")
+    (tmp_path / "scene.ply").write_bytes(header_bytes(len(scene), scene.sh_degree) + row_table(scene).tobytes())
     rows = PlyRows.open(tmp_path / "scene.ply")
     assert rows is not None
     with caplog.at_level("WARNING"):
@@ -128,11 +128,6 @@ def test_gaussians_that_cannot_be_drawn_are_dropped_and_counted_once(tmp_path, c
     assert [r.getMessage() for r in caplog.records if "dropped" in r.getMessage()] == [
         f"{tmp_path / 'scene.ply'}: dropped 200 of 2000 Gaussians with NaN or infinite values"
     ]
-
-
-def write_all(scene: Gaussians, path: Path) -> None:
-    """Write a PLY with all Gaussians of a scene, those that cannot be drawn too."""
-    path.write_bytes(header_bytes(len(scene), scene.sh_degree) + row_table(scene).tobytes())
 
 
 MEMORY = """

@@ -12,7 +12,7 @@ from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.merging import MERGING
 from pointsplat_ns.merging import covariance as algebra
 from pointsplat_ns.merging.covariance import covariances, overlap, plane_axes, projected, projected_area, rms_area
-from pointsplat_ns.merging.pair_cost import DIRECTIONS, PLANE_AXES, TO_PLANE, costs_in_plane, pair_costs
+from pointsplat_ns.merging.pair_cost import DIRECTIONS, costs_in_plane, pair_costs
 from pointsplat_ns.merging.state import Participants, State, initial_state
 from pointsplat_ns.system.kernels import KERNELS
 
@@ -89,14 +89,6 @@ def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     assert got == pytest.approx(want, rel=2e-3)  # float32, where six terms nearly cancel
 
 
-def test_the_matrices_of_all_directions_project_covariances():
-    g = torch.Generator().manual_seed(3)
-    six = algebra.covariances(torch.randn(5, 3, generator=g).double(), torch.randn(5, 4, generator=g).double())
-    for axes, matrix in zip(PLANE_AXES, TO_PLANE, strict=True):
-        want = algebra.projected(six, axes[:, 0].expand(5, 3), axes[:, 1].expand(5, 3))
-        torch.testing.assert_close(six @ matrix, want)
-
-
 def extremes(n: int) -> Gaussians:
     """Positions, sizes and opacities over the whole range."""
     g = torch.Generator().manual_seed(0)
@@ -113,13 +105,13 @@ def extremes(n: int) -> Gaussians:
 @compiled_or_not
 def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
     """Each Gaussian with the next ones."""
-    state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(30)) % 200
+    state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(8)) % 200
     costs = pair_costs(state, others.to(torch.int32), compiled=compiled)
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())
 
 
 @needs_compiler
-@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3), (9, 3), (30, 8)])
+@pytest.mark.parametrize(("k", "axes"), [(1, 1), (6, 8), (8, 3)])
 def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
     """Gaussians of a splat's proportions, some of them opaque, so that replacements grow. A cost is the difference of
     larger numbers, so the error of either is a share of the larger ones of a Gaussian's costs."""

@@ -9,13 +9,12 @@ import torch
 from making import ball, normal_scene, photographed, splats
 from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import views_in_units
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.merging import MERGING, visibility
-from pointsplat_ns.merging.finishing import best_finish, top_of_parabola
+from pointsplat_ns.merging.groups import best_size_change, top_of_parabola
 from pointsplat_ns.merging.state import Participants
-from pointsplat_ns.merging.visibility import covered_per_area, views_and_weights, visibility_weights
+from pointsplat_ns.merging.visibility import covered_per_area, views_and_weights
 from pointsplat_ns.views import Views
 
 
@@ -69,8 +68,7 @@ def test_an_occluded_gaussian_has_a_small_weight():
 def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
     scene = two_walls()
     participants = Participants.of(scene, torch.arange(len(scene)))
-    views = views_in_units(of_origin((0, 0, -4)), participants.centre, participants.size)
-    found = visibility_weights(participants, views, replace(MERGING, max_count_drawn=max_count))
+    _, found = views_and_weights(participants, of_origin((0, 0, -4)), replace(MERGING, max_count_drawn=max_count))
     assert found.shape == (len(scene),)
     front = scene.means[participants.members, 2] < 0
     if max_count > 3:
@@ -129,6 +127,5 @@ def test_the_size_change_that_undoes_a_known_one_is_found(change):
     def psnr_of(trial: float) -> float:
         return reference.psnr(dense.replace(scales=dense.scales + trial - change))
 
-    found = best_finish(psnr_of)
-    assert found.psnr_before == psnr_of(0.0) <= found.psnr == psnr_of(found.size_change)
-    assert found.size_change == pytest.approx(change, abs=0.03)
+    found = best_size_change(psnr_of)
+    assert psnr_of(found) >= psnr_of(0.0) and found == pytest.approx(change, abs=0.03)

@@ -12,7 +12,7 @@ from making import normal_scene, splats
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import METHODS, prune, score_of, select
-from pointsplat_ns.pruning.coverage import mass_shares
+from pointsplat_ns.pruning.baselines import mass_shares
 
 SCORES = {name: method.score for name, method in METHODS.items() if method.score and not method.needs_views}
 

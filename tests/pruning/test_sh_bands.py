@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from making import normal_scene
-from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning import band_energies, cut_sh, energy_lost
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
@@ -52,10 +51,3 @@ def test_where_there_is_nothing_to_lose_nothing_is_lost(case):
     }[case]()
     lost = energy_lost(scene, 0)
     assert lost == pytest.approx(1.0) if case == "huge scales" else lost == 0.0
-
-
-@pytest.mark.parametrize("degree", [-1, 4])
-def test_a_degree_that_is_none_is_said(degree):
-    for function in (cut_sh, energy_lost):
-        with pytest.raises(BudgetError, match=f"SH degree is {degree}; expected 0 to 3"):
-            function(normal_scene(20), degree)

@@ -26,13 +26,7 @@ def picture(scene, viewmat):
     return image[0], alpha[0]
 
 
-def camera():
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[2, 3] = 6.0
-    return viewmat
-
-
-@pytest.mark.parametrize(("seed", "sh_degree"), [(0, 0), (1, 1), (2, 2), (3, 3), (4, 3), (5, 3)])
+@pytest.mark.parametrize(("seed", "sh_degree"), [(0, 0), (1, 1), (2, 2), (3, 3), (4, 3)])
 def test_undo_gives_the_scene_back(seed, sh_degree):
     scene = a_scene(sh_degree=sh_degree, seed=seed)
     transform = random_transform(torch.Generator().manual_seed(seed))
@@ -41,12 +35,12 @@ def test_undo_gives_the_scene_back(seed, sh_degree):
         assert torch.allclose(found, value, atol=1e-12), name
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_turned_scene_looks_the_same_to_a_turned_camera(seed):
-    scene = a_scene(seed=seed)
-    drawn = random_transform(torch.Generator().manual_seed(seed))
+def test_a_turned_scene_looks_the_same_to_a_turned_camera():
+    scene = a_scene()
+    drawn = random_transform(torch.Generator().manual_seed(0))
     turn = Transform(drawn.quat, False, torch.ones(3, dtype=torch.float64), torch.arange(3))
-    viewmat = camera()
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[2, 3] = 6.0
     turned = viewmat.clone()
     turned[:3, :3] = viewmat[:3, :3] @ turn.matrix.T
     before, after = picture(scene, viewmat), picture(turn.apply(scene), turned)

@@ -73,9 +73,9 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Gate the geometry branch by the appearance branch (the paper's Table 4); dual encoder only."""
     use_position: bool = True
     """Add the positional term delta to both branches (the paper's Table 4); dual encoder only."""
-    norm: Literal["scene", "batch", "layer"] = "scene"
+    norm: Literal["scene", "batch"] = "scene"
     """Normalisation outside the attention blocks. scene: statistics of the current scene, also in evaluation. batch:
-    the published one, with running averages over the training scenes in evaluation. layer: per Gaussian."""
+    the published one, with running averages over the training scenes in evaluation."""
     enc_depths: tuple[int, ...] | None = None
     """Blocks in each stage of the backbone's encoder; by default those of size."""
     stem: Literal["conv", "linear"] = "conv"

@@ -70,8 +70,8 @@ class PointSplatPipeline(VanillaPipeline):
             )
         if world_size > 1 and config.model.norm == "batch":
             raise SceneError(
-                "--pipeline.model.norm batch: its statistics are of the scenes of one process; expected scene or layer "
-                "where several processes train together"
+                "--pipeline.model.norm batch: its statistics are of the scenes of one process; expected scene where "
+                "several processes train together"
             )
         if world_size > 1 and torch.device(device).type == "cuda":
             torch.cuda.set_device(local_rank)  # nccl gathers objects through the current device

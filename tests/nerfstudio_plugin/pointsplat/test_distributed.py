@@ -207,7 +207,7 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
     config.pipeline.model.norm = "batch"
     with (
         mock.patch("pointsplat_ns.system.processes.world_size", return_value=2),
-        pytest.raises(SceneError, match="--pipeline.model.norm batch: .*expected scene or layer"),
+        pytest.raises(SceneError, match="--pipeline.model.norm batch: .*expected scene where"),
     ):
         config.pipeline.setup(device="cpu", test_mode="val", world_size=2)
 
