@@ -2,11 +2,8 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
-import pytest
-
-from lab.judge import ablation, record, scenes
+from lab.judge import ablation, scenes
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.merging import MERGING, merge
@@ -14,11 +11,7 @@ from pointsplat_ns.merging import MERGING, merge
 TWO = ("no_regrouping", "growth_0")
 
 
-def rows_of(path: Path) -> list[dict]:
-    return json.loads(path.read_text())["rows"]
-
-
-def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
+def test_each_field_of_merging_is_changed_by_some_variant():
     changed = {field for found in ablation.VARIANTS.values() for field in found}
     known = vars(MERGING) | vars(LOOKING)
     assert vars(MERGING).keys() <= changed <= known.keys()
@@ -26,10 +19,10 @@ def test_some_variant_changes_each_field_of_merging_and_none_changes_nothing():
         assert any(known[field] != value for field, value in found.items()), name
 
 
-def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
+def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
     results = tmp_path / "rows.json"
     ablation.main((small,), keep=(0.2,), variants=TWO, views=2, width=64, json_path=results)
-    rows = rows_of(results)
+    rows = json.loads(results.read_text())["rows"]
     assert [row["method"] for row in rows] == ["default", *TWO]
     scene = scenes.load(small, (64,), 2)
     for row, changes in zip(rows, ({}, {"regrouping_rounds": 0}, {"growth_exponent": 0.0}), strict=True):
@@ -41,9 +34,3 @@ def test_every_variant_has_the_psnr_of_what_merging_makes_with_its_settings(smal
     assert len({row["covered_psnr"] for row in rows}) == 3
     said = capsys.readouterr().out
     assert all(name in said for name in TWO) and "| 20 % |" in said
-
-
-@pytest.mark.usefixtures("usual_looking")
-def test_the_record_that_is_committed_has_the_page_of_its_rows():
-    rows, settings = record.read([record.FOLDER / "ablation.json"], "ablation.py")
-    assert (record.FOLDER / "ablation.md").read_text("utf-8") == ablation.page(rows, settings)

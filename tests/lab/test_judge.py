@@ -1,13 +1,13 @@
 """lab/judge: the camera paths that ship, what is measured in their views, and rows that are kept."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
 from lab.judge import camera_paths, judge, levels, record, scenes
+from making import run_of
 from peers import peer
 
 PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
@@ -40,31 +40,23 @@ def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"small.ply", "small.json", "rows.json", "peer-3.7.0"}
 
 
-FAILS = """#!/bin/sh
-case "$*" in *--version*) echo "splat-transform v2.0.0";; *) echo "out of memory" >&2; exit 3;; esac
-"""
-
-
 def test_a_way_that_fails_is_noted_and_measured_again(small, tmp_path, capsys):
-    results, broken = tmp_path / "rows.json", tmp_path / "broken"
-    broken.write_text(FAILS)
-    broken.chmod(0o755)
+    results, broken = tmp_path / "rows.json", peer(tmp_path, "2.0.0", fails="--decimate")
     options = {"keep": (0.5,), "ways": (), "widths": (32,), "views": 1, "lpips": False, "json_path": results}
-    judge.main((small,), **options, splat_transform=(str(broken), peer(tmp_path, "2.7.1")))
+    judge.main((small,), **options, splat_transform=(broken, peer(tmp_path, "2.7.1")))
     said = capsys.readouterr().out
     failed, fine = json.loads(results.read_text())["rows"]
-    assert failed["method"] == "splat-transform 2.0.0" and "out of memory" in failed["failed"]
+    assert failed["method"] == "splat-transform 2.0.0" and "out of luck" in failed["failed"]
     assert failed["covered_psnr"] is failed["seconds"] is None and fine["covered_psnr"] > 0
     assert "splat-transform 2.0.0 at 50 % failed" in said
-    mended = Path(peer(tmp_path, "2.0.0"))
-    judge.main((small,), **options, resume=True, splat_transform=(str(mended),))
+    judge.main((small,), **options, resume=True, splat_transform=(peer(tmp_path, "2.0.0"),))
     rows = json.loads(results.read_text())["rows"]
     assert [row["failed"] for row in rows] == ["", ""] and rows[1] == fine
 
 
 def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp_path, capsys):
     results = tmp_path / "rows.json"
-    [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    run = run_of(trained_walls, "wall-a")
     options = {"keep": (0.5,), "ways": (), "views": 2, "lpips": False, "json_path": results}
     judge.main((run,), **options, splat_transform=(peer(tmp_path, "2.7.1"),))
     [row] = json.loads(results.read_text())["rows"]
@@ -83,9 +75,8 @@ def test_means_and_leads_are_over_scenes_that_have_every_way():
     ]
     figures = record.Figures(rows)
     text = record.section(figures, 960)
-    assert (
-        figures.scenes(960) == "2" and "| 10 % | 26.00 (24.00 rock) | 27.50 (25.00 rock) | 29.00 (27.00 rock) |" in text
-    )
+    assert figures.scenes(960) == "2"
+    assert "| 10 % | 26.00 (24.00 rock) | 27.50 (25.00 rock) | 29.00 (27.00 rock) |" in text
     assert "| 10 % | +1.50 (+1.00 rock) | +1.50 (+1.00 chair) |" in text
 
 

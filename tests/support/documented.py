@@ -59,26 +59,17 @@ class Command:
 
 def blocks_of(page: Path) -> Iterator[Block]:
     """The fenced blocks of a page, also those indented in a list."""
-    language, first, indent, lines = None, 0, 0, []
-    for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
-        fence = re.match(r"( *)```(\w*)\s*$", line)
-        if fence and language is None:
-            indent, language, first, lines = len(fence[1]), fence[2], number + 1, []
-        elif fence and language is not None:
-            yield Block(page, first, language, "\n".join(lines))
-            language = None
-        elif language is not None:
-            lines.append(line[indent:])
-    assert language is None, f"{page}: the block at line {first} does not end"
+    text = page.read_text("utf-8")
+    assert len(re.findall(r"^ *```", text, re.MULTILINE)) % 2 == 0, f"{page}: a block does not end"
+    for found in re.finditer(r"^( *)```(\w*)\n(.*?)^ *```$", text, re.MULTILINE | re.DOTALL):
+        lines = [line.removeprefix(found[1]) for line in found[3].splitlines()]
+        yield Block(page, text.count("\n", 0, found.start(3)) + 1, found[2], "\n".join(lines))
 
 
 def commands_of(block: Block) -> Iterator[Command]:
     """The command lines of a block, without comments and without settings of the environment before them."""
-    joined = block.text.replace("\\\n", " ")
-    for line in joined.splitlines():
-        words = shlex.split(line, comments=True)
-        while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
-            words.pop(0)
+    for line in block.text.replace("\\\n", " ").splitlines():
+        words = shlex.split(re.sub(r"^([A-Z_]+=\S* )+", "", line), comments=True)
         if words:
             yield Command(block.where, tuple(words))
 

@@ -35,7 +35,6 @@ class Parts(HTMLParser):
 
 
 def parts_of(path: Path) -> Parts:
-    """The parts of a file."""
     return Parts(path.read_text("utf-8"))
 
 
@@ -47,7 +46,7 @@ def policy_of(parts: Parts) -> dict[str, str]:
 
 def hashed(text: str) -> str:
     """The source in a policy that allows one inline script or style."""
-    return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() + "'"
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def names_nothing_outside(path: Path) -> None:

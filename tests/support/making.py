@@ -26,7 +26,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
 
-
 QUICK_START = REPOSITORY / "tests" / "support" / "quick_start"
 """First on the path of programs of nerfstudio that need not list the methods of others."""
 
@@ -159,12 +158,7 @@ def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = Fal
 
 
 def splats_in_view(
-    n: int,
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-    scale: float = -3.0,
-    spread: float = 0.8,
-    opacity: float = 1.0,
+    n: int, seed: int = 0, dtype=torch.float64, scale: float = -3.0, spread: float = 0.8, opacity: float = 1.0
 ) -> list[torch.Tensor]:
     """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N, 4), scales (N, 3),
     opacities (N,) and SH of degree 3 (N, 16, 3)."""
@@ -173,33 +167,29 @@ def splats_in_view(
     def randn(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=torch.float64) + torch.tensor([0, 0, 3.0]).double()
+    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5]).double() + torch.tensor([0, 0, 3.0]).double()
     scales = torch.exp(randn(n, 3) * spread + scale)
     opacities = torch.rand(n, generator=generator, dtype=torch.float64) * opacity
     return [value.to(dtype) for value in (means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3)]
 
 
-def camera_askew(
-    dtype: torch.dtype = torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0
-) -> tuple[torch.Tensor, torch.Tensor]:
+def camera_askew(dtype=torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0):
     """World-to-camera matrix (4, 4), turned by ``angle`` radians and moved a little, and intrinsics (3, 3) in pixels
     whose principal point is not the middle of any usual image."""
-    K = torch.tensor([[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]], dtype=dtype)
-    view = torch.eye(4, dtype=dtype)
     c, s = math.cos(angle), math.sin(angle)
-    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
-    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
-    return view, K
+    view = [[c, 0, s, 0.1], [0, 1, 0, -0.1], [-s, 0, c, 0.2], [0, 0, 0, 1]]
+    K = [[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]]
+    return torch.tensor(view, dtype=dtype), torch.tensor(K, dtype=dtype)
 
 
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that residuals are not zero."""
     from pointsplat_ns.refiner import Refiner, preset
 
-    encoder = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2)}
-    decoder = {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "patch": 32, "head_width": 16}
+    sizes = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2), "patch": 32}
+    sizes |= {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "head_width": 16}
     torch.manual_seed(seed)
-    refiner = Refiner(preset("tiny", **{**encoder, **decoder, **changes})).eval()
+    refiner = Refiner(preset("tiny", **sizes | changes)).eval()
     return move_zero_layers(refiner) if trained else refiner
 
 
@@ -245,7 +235,6 @@ def dense_config(data: Path, output_dir: Path, steps: int):
 @contextmanager
 def views_sampled_once() -> Iterator[None]:
     """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""
-    from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 
     known = {}
@@ -322,13 +311,7 @@ class FewViews(ViewSource):
 
 
 def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> torch.Tensor:
-    """Which points are in the pictures of views, (C, N) bool.
-
-    Args:
-        views: C cameras.
-        points: (N, 3) float64, in the unit of the views.
-        min_depth: depth that points must exceed.
-    """
+    """Which points (N, 3) beyond a depth are in the pictures of C views, (C, N) bool."""
     at = views.viewmats[:, :3, :3].to(points) @ points.T + views.viewmats[:, :3, 3:].to(points)
     x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
     within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)

@@ -5,10 +5,11 @@ import pytest
 import pointsplat_ns as ps
 from lab.common.ways import SplatTransform
 from making import box_room
+from peers import peer
 
 
-def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
-    found = SplatTransform(peer())
+def test_each_mode_makes_a_smaller_scene(tmp_path):
+    found = SplatTransform(peer(tmp_path, "3.7.0"))
     assert (found.version, found.missing) == ("3.7.0", "")
     ps.save(box_room(0, 60), tmp_path / "room.ply")
     before = sorted(tmp_path.iterdir())
@@ -26,6 +27,6 @@ def test_each_mode_makes_a_smaller_scene(peer, tmp_path):
         ("warning: old\nv3.0.0", "3.0.0", 2),
     ],
 )
-def test_versions_are_told_apart(peer, says, version, modes):
-    found = SplatTransform(peer(says))
+def test_versions_are_told_apart(says, version, modes, tmp_path):
+    found = SplatTransform(peer(tmp_path, "3.7.0", says))
     assert found.version == version and len(found.modes) == modes
