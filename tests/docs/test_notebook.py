@@ -5,17 +5,21 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
+from quick_looking import QUICK
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 
-SMALLER = """
+SMALLER = f"""
 import pointsplat_ns as ps
 from pointsplat_ns import api
 from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import settings, view_source
 
-ps.save(ps.prune(ps.example_room(), 3000, by="coverage"), "room.ply")
-api.EXAMPLE, repair.STEPS["quick"] = "room.ply", 2
+ps.save(ps.example_room()[::30], "room.ply")
+api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
+settings.changed({QUICK}).__enter__()
 """
-"""Run before all cells: the scene that ships cut to a tenth, and a repair of two steps."""
+"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and small views."""
 
 
 def test_notebook_shows_three_pictures_and_says_what_compacting_brought(tmp_path, monkeypatch):

@@ -5,6 +5,8 @@ import json
 import pytest
 import torch
 
+import pointsplat_ns as ps
+from lab.common.programs import Usage, run_measured
 from lab.judge import ablation, record, tables_record
 from lab.judge import bytes as judge_of_bytes
 from lab.judge.record import FOLDER as RECORD
@@ -13,6 +15,7 @@ from lab.speed import beside, rasterizer
 from lab.training import with_photos
 from making import box_room
 from peers import peer
+from pointsplat_ns.cli import main
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
 from quick_looking import USUAL
@@ -84,8 +87,20 @@ def test_variants_are_timed_with_their_errors(tmp_path, capsys):
     assert "fast / eager" in capsys.readouterr().out
 
 
+def run_here(args: list[str]) -> Usage:
+    """Run in this process what would import torch in one of its own: our command, and splat-transform's conversion."""
+    if args[1] == "-c":
+        main(args[3:])
+    elif len(args) == 6:
+        ps.save(ps.load(args[4]), args[5])
+    else:
+        return run_measured(args)
+    return Usage(1.0, 1.0, 1)
+
+
 def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
     found = tmp_path / "found.json"
+    monkeypatch.setattr(judge_of_bytes, "run_measured", run_here)
 
     def measure(**options: object) -> list[dict]:
         judge_of_bytes.main(

@@ -8,10 +8,6 @@ import re, sys
 if "--version" in sys.argv:
     print({says!r})
     sys.exit()
-if len(sys.argv) == 6:
-    import pointsplat_ns as ps
-    ps.save(ps.load(sys.argv[4]), sys.argv[5])
-    sys.exit()
 overwrite, device, cpu, source, option, count, target = sys.argv[1:]
 if option == {fails!r}:
     sys.exit("out of luck")
@@ -23,8 +19,7 @@ rows = rows[: count * size] if option == "--decimate" else rows[-count * size :]
 header = re.sub(rb"element vertex \\d+", b"element vertex %d" % count, header)
 open(target, "wb").write(header + found + rows)
 """
-"""Stands for splat-transform, a Node package: takes its options, and keeps the first or the last Gaussians, or writes a
-scene in another format."""
+"""Stands for splat-transform, a Node package: takes its options, and keeps the first or the last Gaussians."""
 
 
 def peer(folder: Path, version: str, says: str | None = None, fails: str = "") -> str:
