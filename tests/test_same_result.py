@@ -18,7 +18,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def looks(room):
-    return ps.sample_views(room, 3, width=48, height=36)
+    return ps.sample_views(room, 2, width=32, height=24)
 
 
 @pytest.mark.parametrize("by", METHODS)

@@ -22,7 +22,7 @@ OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-prin
 OTHERS = ("docker", "git", "npm", "pip", "pre-commit", "uv")
 """Programs of others, whose arguments nothing here reads."""
 
-CUT = 1500
+CUT = 800
 """Gaussians of the scene that commands are run on: enough to draw, few enough for a second each."""
 
 

@@ -29,8 +29,8 @@ def outcome(words: list[str]) -> dict:
     from pointsplat_ns.cli import main
 
     tried.clear()
-    out, err, status = io.StringIO(), io.StringIO(), 0
-    with redirect_stdout(out), redirect_stderr(err):
+    status = 0
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
         try:
             main(words)
         except SystemExit as end:

@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from posing import write_colmap
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
-HALF_SIZE = np.array([1.6, 1.3, 1.0])
-"""Half the sides of the room, about the origin; z is up."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SEEDS = 300
 HIDDEN = np.s_[30:42, 10:26]
@@ -67,8 +65,9 @@ def colors_at(points: np.ndarray) -> np.ndarray:
 
 def seen_from(eye: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Where rays (..., 3) from within the room meet its walls, (..., 3)."""
+    half_size = np.array([1.6, 1.3, 1.0])  # of the room, about the origin; z is up
     with np.errstate(divide="ignore"):
-        lengths = (np.sign(directions) * HALF_SIZE - eye) / directions
+        lengths = (np.sign(directions) * half_size - eye) / directions
     return eye + directions * lengths.min(axis=-1, keepdims=True)
 
 
@@ -76,7 +75,7 @@ class Capture:
     """Photos of the room by one lens. Poses (N, 4, 4) are camera-to-world in OpenGL axes, as nerfstudio's."""
 
     def __init__(self, lens: Lens | None = None):
-        self.lens = Lens() if lens is None else lens
+        self.lens = lens or Lens()
         rng = np.random.default_rng(11)
         turns = np.linspace(0, 2 * math.pi, FRAMES, endpoint=False)
         self.poses = np.tile(np.eye(4), (FRAMES, 1, 1))
@@ -130,14 +129,12 @@ class Capture:
         a frame of its own."""
         names = self.write_photos(folder / "dslr/resized_images")
         (folder / "dslr/resized_anon_masks").mkdir()
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[HIDDEN] = 0
         frames = []
         for number, (name, pose) in enumerate(zip(names, self.poses, strict=True)):
             photo = folder / "dslr/resized_images" / name
-            spoilt = cv2.imread(str(photo))
-            spoilt[HIDDEN] = (255, 0, 255)
-            cv2.imwrite(str(photo), spoilt)
-            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-            mask[HIDDEN] = 0
+            cv2.imwrite(str(photo), np.where(mask[..., None] > 0, cv2.imread(str(photo)), np.uint8([255, 0, 255])))
             cv2.imwrite(str(folder / "dslr/resized_anon_masks" / name), mask)
             frame = {"file_path": name, "mask_path": name, "transform_matrix": pose.tolist()}
             frames.append({**frame, "is_bad": number in BAD})
@@ -147,7 +144,6 @@ class Capture:
         (folder / "dslr/nerfstudio").mkdir()
         (folder / "dslr/nerfstudio/transforms.json").write_text(json.dumps(meta))
         moved = np.eye(4)
-        moved[:3, :3] = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
-        moved[:3, 3] = 3.0, -2.0, 0.5
+        moved[:3] = np.c_[Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), [3.0, -2.0, 0.5]]
         self.write_colmap(folder / "dslr/colmap", names, moved)
         return folder

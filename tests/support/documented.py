@@ -11,8 +11,8 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import tyro
@@ -32,8 +32,7 @@ PAGES = [
 NS_PROGRAMS = ("ns-train", "ns-eval", "ns-render", "ns-export", "ns-viewer")
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """A fenced block of code."""
 
     page: Path
@@ -46,8 +45,7 @@ class Block:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """One command line."""
 
     where: str
@@ -127,9 +125,9 @@ def parsers_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def start(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Start a console script, or a program of the lab by ``python -m module``, in this process."""
-    before = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patch, warnings.catch_warnings(), ExitStack() as after:
-        after.callback(signal.signal, signal.SIGTERM, before)  # a program that has a process to itself may change it
+        # a program that has a process to itself may change it
+        after.callback(signal.signal, signal.SIGTERM, signal.getsignal(signal.SIGTERM))
         if words[:2] == ("python", "-m"):
             warnings.simplefilter("ignore", RuntimeWarning)  # the module may be imported already
             patch.setattr(sys, "argv", [words[2], *words[3:]])

@@ -33,32 +33,13 @@ class Golden:
     background: tuple[float, ...] | None = None
     principal: tuple[float, float] = (13.5, 8.4)
     focal: tuple[float, float] = (24.0, 25.0)
-    change: Callable[[dict[str, Tensor]], None] = field(default=lambda scene: None)
+    change: Callable[[Tensor, Tensor, Tensor], dict] = field(default=lambda means, scales, opacities: {})
 
 
-def _needles(scene: dict[str, Tensor]) -> None:
-    scene["scales"][:, 0], scene["scales"][:, 1:] = 2.0, 1e-3
-
-
-def _opaque(scene: dict[str, Tensor]) -> None:
-    scene["opacities"][:] = 1.0
-    scene["scales"] *= 2.5
-
-
-def _below_a_pixel(scene: dict[str, Tensor]) -> None:
-    scene["scales"] *= 0.1
-    scene["opacities"][:] = 1.0
-
-
-def _large_and_faint(scene: dict[str, Tensor]) -> None:
-    scene["scales"] *= 8
-    scene["opacities"] *= 0.3
-
-
-def _around_the_camera(scene: dict[str, Tensor]) -> None:
-    scene["means"][::2, 2] -= 2.9  # some behind it, some before the near plane, some beside the field of view
-    scene["scales"] *= 0.5
-
+ONES = torch.ones(COUNT, dtype=torch.float64)
+NEEDLE = torch.tensor([2.0, 1e-3, 1e-3], dtype=torch.float64).repeat(COUNT, 1)
+BEHIND = torch.tensor([[0.0, 0.0, -2.9], [0.0, 0.0, 0.0]], dtype=torch.float64).repeat(COUNT // 2, 1)
+"""Half are moved: some behind the camera, some before the near plane, some beside the field of view."""
 
 SCENES = {
     "colours": Golden(0, sh_degree=None),
@@ -68,11 +49,21 @@ SCENES = {
     "degree 3 with expected depth": Golden(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
     "seven channels": Golden(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
     "antialiased": Golden(6, mode="antialiased"),
-    "antialiased below a pixel": Golden(7, mode="antialiased", change=_below_a_pixel),
-    "needles": Golden(8, sh_degree=1, change=_needles),
-    "opaque": Golden(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
-    "large and faint": Golden(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
-    "around the camera": Golden(11, None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera),
+    "antialiased below a pixel": Golden(
+        7, mode="antialiased", change=lambda _, s, __: {"scales": 0.1 * s, "opacities": ONES}
+    ),
+    "needles": Golden(8, sh_degree=1, change=lambda *_: {"scales": NEEDLE}),
+    "opaque": Golden(9, 1, background=(1.0, 1.0, 1.0), change=lambda _, s, __: {"scales": 2.5 * s, "opacities": ONES}),
+    "large and faint": Golden(
+        10, 2, mode="antialiased", change=lambda _, s, o: {"scales": 8 * s, "opacities": 0.3 * o}
+    ),
+    "around the camera": Golden(
+        11,
+        None,
+        principal=(30.0, -4.0),
+        focal=(15.0, 22.0),
+        change=lambda m, s, _: {"means": m + BEHIND, "scales": 0.5 * s},
+    ),  # fmt: skip
 }
 
 
@@ -97,7 +88,7 @@ def made(name: str) -> dict[str, Tensor]:
         "opacities": torch.from_numpy(random.uniform(0.2, 0.98, COUNT)),
         "colors": colors,
     }
-    golden.change(scene)
+    scene |= golden.change(scene["means"], scene["scales"], scene["opacities"])
     cos, sin = math.cos(0.15), math.sin(0.15)
     rows = [[cos, 0.0, sin, -0.4], [0.0, 1.0, 0.0, 0.05], [-sin, 0.0, cos, 0.1], [0.0, 0.0, 0.0, 1.0]]
     view = torch.tensor(rows, dtype=torch.float64)

@@ -25,8 +25,7 @@ open(target, "wb").write(header + found + rows)
 def peer(folder: Path, version: str, says: str | None = None, fails: str = "") -> str:
     """The path of such a program, written into a folder; from version 3 on it has two modes."""
     says = f"splat-transform v{version} (0123abc)" if says is None else says
-    modern = int(version.split(".")[0]) >= 3
-    options = ("--decimate", "--decimate-adaptive") if modern else ("--decimate",)
+    options = ("--decimate", "--decimate-adaptive")[: 1 + (version >= "3")]
     path = folder / f"peer-{version}"
     path.write_text(PEER.format(python=sys.executable, says=says, fails=fails, options=options))
     path.chmod(0o755)
