@@ -14,13 +14,13 @@ from importlib import metadata
 from unittest import mock
 
 import pytest
-import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from refusing import refusal
 
 import pointsplat_ns as ps
 from lab import demo
+from lab.robustness.fuzz_readers import run_with_photos
 from making import REPOSITORY, imports_of
 from pointsplat_ns.errors import MissingPackageError, need
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
@@ -34,19 +34,6 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["pro
 EXTRAS = PROJECT["optional-dependencies"]
 CORE, NERFSTUDIO = ([*map(Requirement, texts)] for texts in (PROJECT["dependencies"], EXTRAS["nerfstudio"]))
 
-RUN_CONFIG = """\
-!!python/object:nerfstudio.engine.trainer.TrainerConfig
-data: photos
-experiment_name: kitchen
-method_name: splatfacto
-pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
-  datamanager: !!python/object:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanagerConfig
-    dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig {}
-  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
-    sh_degree: 3
-timestamp: run
-"""
-
 RUNS = {
     "--version": "pointsplat-ns",
     "info room.ply": "200 Gaussians",
@@ -56,7 +43,7 @@ RUNS = {
     "tradeoff room.ply --keep 10% --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
     "convert room.ply room.sog": "200 Gaussians",
     "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.1 --fps 20": "2 frames",
-    "export run -o exported.ply": "100 Gaussians",
+    "export run -o exported.ply": "6 Gaussians",
     "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",
 }
 """Commands that nothing is missing for, and what they print."""
@@ -93,12 +80,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
                 (packages / top).symlink_to(distribution.locate_file(top))
 
     ps.save(ps.prune(ps.example_room(), 200, by="coverage"), work / "room.ply")
-    (work / "photos").mkdir()
-    (work / "run" / "nerfstudio_models").mkdir(parents=True)
-    (work / "run" / "config.yml").write_text(RUN_CONFIG)
-    scene = ps.load(work / "room.ply")[:100]
-    content = {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in scene.items()}}
-    torch.save(content, work / "run" / "nerfstudio_models" / "step-000000009.ckpt")
+    run_with_photos(work / "run")
 
     lines = [*RUNS, LACKS]
     environment = {
