@@ -9,15 +9,36 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
+from lab.common.programs import Usage, run_measured
 from lab.judge import ablation, camera_paths, cleaning, judge, levels, record, refiners, scenes
-from making import move_zero_layers, run_of
+from lab.judge import bytes as equal_bytes
+from making import box_room, move_zero_layers, run_of
 from peers import peer
-from pointsplat_ns.io import read_scene
+from pointsplat_ns.cli import main
+from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
 PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
+
+
+VIEWS = {
+    "scene": "small",
+    "about": "The walls of a room, from its middle.",
+    "up": [0, 0, 1],
+    "field_of_view": 60,
+    "views": [{"eye": [0.2, 0.1, 0], "at": [2, 0, 0]}, {"eye": [0, 0, 0.3], "at": [0, 1.5, 0]}],
+}
+
+
+@pytest.fixture()
+def small(tmp_path, monkeypatch) -> Path:
+    """A room of 900 Gaussians with a path of two views."""
+    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
+    (tmp_path / "small.json").write_text(json.dumps(VIEWS))
+    write_ply(box_room(seed=3), tmp_path / "small.ply")
+    return tmp_path / "small.ply"
 
 
 def rows_of(results: Path) -> list[dict]:
@@ -164,3 +185,37 @@ def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):
     lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
     none, most = ([cell.strip() for cell in line] for line in lines)
     assert none[:3] == ["0", "0.00", "+0.000"] and most[0] == "1" and float(most[1]) >= 0
+
+
+def run_here(args: list[str]) -> Usage:
+    """Run in this process what would import torch in one of its own: our command, and splat-transform's conversion."""
+    if args[1] == "-c":
+        main(args[3:])
+    elif len(args) == 6:
+        ps.save(ps.load(args[4]), args[5])
+    else:
+        return run_measured(args)
+    return Usage(1.0, 1.0, 1)
+
+
+def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
+    found = tmp_path / "found.json"
+    monkeypatch.setattr(equal_bytes, "run_measured", run_here)
+
+    def measure(**options: object) -> list[dict]:
+        equal_bytes.main(
+            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
+            width=48, json_path=found, **options,
+        )  # fmt: skip
+        return rows_of(found)
+
+    rows = measure(picture=tmp_path / "found.png")
+    assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
+    ours, peers = rows
+    assert 7200 <= ours["bytes"] <= 8000 and 7700 <= peers["bytes"] <= 8000 and ours["count"] > peers["count"]
+    [[lead]] = equal_bytes.leads(rows).to_numpy()
+    assert lead == pytest.approx(ours["covered_psnr"] - peers["covered_psnr"])
+    assert f"{lead:+.1f} small" in capsys.readouterr().out
+
+    monkeypatch.setattr(equal_bytes, "run_measured", lambda *_: pytest.fail("measured again"))
+    assert measure(resume=True) == rows

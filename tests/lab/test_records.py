@@ -5,17 +5,13 @@ import json
 import pytest
 import torch
 
-import pointsplat_ns as ps
-from lab.common.programs import Usage, run_measured
 from lab.judge import ablation, record, tables_record
-from lab.judge import bytes as judge_of_bytes
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
 from lab.training import with_photos
 from making import box_room
 from peers import peer
-from pointsplat_ns.cli import main
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
 from quick_looking import USUAL
@@ -85,37 +81,3 @@ def test_variants_are_timed_with_their_errors(tmp_path, capsys):
     assert case["errors"]["eager max"] == 0 < case["errors"]["fast max"] and 20 < case["errors"]["fast PSNR"] < 80
     assert 32 * 24 * 300 > case["pairs"] > case["visible"] > 0 and 300 >= case["visible"]
     assert "fast / eager" in capsys.readouterr().out
-
-
-def run_here(args: list[str]) -> Usage:
-    """Run in this process what would import torch in one of its own: our command, and splat-transform's conversion."""
-    if args[1] == "-c":
-        main(args[3:])
-    elif len(args) == 6:
-        ps.save(ps.load(args[4]), args[5])
-    else:
-        return run_measured(args)
-    return Usage(1.0, 1.0, 1)
-
-
-def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
-    found = tmp_path / "found.json"
-    monkeypatch.setattr(judge_of_bytes, "run_measured", run_here)
-
-    def measure(**options: object) -> list[dict]:
-        judge_of_bytes.main(
-            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
-            width=48, json_path=found, **options,
-        )  # fmt: skip
-        return json.loads(found.read_text())["rows"]
-
-    rows = measure(picture=tmp_path / "found.png")
-    assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
-    ours, peers = rows
-    assert 7200 <= ours["bytes"] <= 8000 and 7700 <= peers["bytes"] <= 8000 and ours["count"] > peers["count"]
-    [[lead]] = judge_of_bytes.leads(rows).to_numpy()
-    assert lead == pytest.approx(ours["covered_psnr"] - peers["covered_psnr"])
-    assert f"{lead:+.1f} small" in capsys.readouterr().out
-
-    monkeypatch.setattr(judge_of_bytes, "run_measured", lambda *_: pytest.fail("measured again"))
-    assert measure(resume=True) == rows
