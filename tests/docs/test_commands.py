@@ -61,7 +61,7 @@ def test_block_names_its_language_and_reads_a_room_that_was_written(block):
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
-def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
+def test_command_is_one_that_works(command, tmp_path, monkeypatch):
     words = command.words
     assert not {"|", "&&", ";", ">", "<"} & set(words), "one command a line, please"
     program = words[0]
@@ -70,21 +70,21 @@ def test_command_is_one_that_works(command, tmp_path, monkeypatch, capsys):
             start((*words[:-1], str(tmp_path / "script")), monkeypatch)
         assert program in (tmp_path / "script").read_text()
     elif program in ("pointsplat", *NS_PROGRAMS):
-        check_arguments(words, monkeypatch, capsys)
+        check_arguments(words, monkeypatch)
     elif program == "ns-process-data":  # which looks for programs before it has read its arguments
         for check in ("check_ffmpeg_installed", "check_colmap_installed"):
             monkeypatch.setattr(f"nerfstudio.utils.install_checks.{check}", lambda *_: None)
-        check_arguments(words, monkeypatch, capsys)
+        check_arguments(words, monkeypatch)
     elif words[:3] == ("python", "-m", "pytest"):
         assert all((ROOT / word).exists() for word in words[3:] if not word.startswith("-"))
     elif words[:2] == ("python", "-m"):
         assert words[2].startswith("lab."), "no rule for this module"
-        check_arguments(words, monkeypatch, capsys)
+        check_arguments(words, monkeypatch)
     elif program == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif words[:2] == ("docker", "run"):
-        check_arguments(words[words.index("pointsplat") :], monkeypatch, capsys)
+        check_arguments(words[words.index("pointsplat") :], monkeypatch)
     else:
         assert program in OTHERS, f"no rule checks {program}; add one"
 
@@ -139,11 +139,11 @@ def test_options_named_in_text_exist(monkeypatch, capsys):
         assert not unknown, page.name
 
 
-def test_training_options_named_in_text_are_accepted_with_their_values(monkeypatch, capsys):
+def test_training_options_named_in_text_are_accepted_with_their_values(monkeypatch):
     named = {code for _, code in inline_code() if re.match(r"--\S+ \S", code) and "pipeline" in code}
     assert named, "expected some, such as `--pipeline.model.encoder concat`"
     for code in sorted(named):
-        check_arguments(("ns-train", "pointsplat", *shlex.split(code)), monkeypatch, capsys)
+        check_arguments(("ns-train", "pointsplat", *shlex.split(code)), monkeypatch)
 
 
 def test_names_of_the_package_and_paths_in_text_exist():
