@@ -110,9 +110,7 @@ def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(measured, 
 
 def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkeypatch):
     few, every = ("dense", "paper", "lightgaussian"), Ways.cells
-    monkeypatch.setattr(
-        Ways, "cells", lambda ways, shares: [cell for cell in every(ways, shares) if cell[0].name in few]
-    )
+    monkeypatch.setattr(Ways, "cells", lambda *given: [cell for cell in every(*given) if cell[0].name in few])
     figures, asked = Judge.figures, []
 
     def interrupted(self, scene):
