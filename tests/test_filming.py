@@ -25,6 +25,14 @@ def scene() -> ps.Gaussians:
     return ball(700)
 
 
+@pytest.fixture(scope="module")
+def files(scene, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    ps.save(scene, folder / "ball.ply")
+    ps.save(scene[::2], folder / "half.splat")
+    return folder
+
+
 def frames_in(folder: Path) -> list[np.ndarray]:
     return [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
 
@@ -63,10 +71,12 @@ def test_saved_path_gives_size_speed_and_cameras(scene, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"path": "nowhere.json"}, "nowhere.json: no such file"),
         ({"path": "spiral"}, "spiral: no such file; expected a camera path"),
         ({"split": "diagonal"}, "expected side-by-side or wipe"),
         ({"width": 1}, "width is 1; expected 2 to 16384"),
         ({"height": 10**6}, "height is 1000000"),
+        ({"fps": 0}, "fps is 0"),
         ({"fps": float("nan")}, "fps is nan"),
         ({"seconds": -1}, "seconds are -1"),
         ({"seconds": 1e9}, "seconds are 1e.09"),
@@ -78,11 +88,9 @@ def test_what_means_nothing_is_refused(options, message, scene, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_command_writes_what_the_function_writes(scene, tmp_path, capsys):
+def test_command_writes_what_the_function_writes(files, tmp_path, capsys):
     options = ["--width", "64", "--height", "48", "--fps", "10", "--seconds", "0.3", "--split", "wipe"]
-    scenes = [str(tmp_path / name) for name in ("ball.ply", "half.splat")]
-    ps.save(scene, scenes[0])
-    ps.save(scene[::2], scenes[1])
+    scenes = [str(files / "ball.ply"), str(files / "half.splat")]
     main(["render", *scenes, "-o", str(tmp_path / "by_command"), *options])
     assert re.search(r"by_command: 3 frames, [\d.]+ kB, in ", capsys.readouterr().out)
     ps.render_path(scenes[0], tmp_path / "by_function", scenes[1], split="wipe", seconds=0.3, **SMALL)
@@ -99,8 +107,8 @@ def test_given_views_keep_their_size_and_photos_are_reduced(scene, tmp_path):
     assert Image.open(tmp_path / "narrow.png").size == (80, 4)
 
 
-def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(scene, tmp_path, capsys):
-    ps.save(scene, tmp_path / "ball.ply")
+def test_command_writes_a_video_beside_the_scene_and_overwrites_nothing(files, tmp_path, capsys):
+    (tmp_path / "ball.ply").write_bytes((files / "ball.ply").read_bytes())
     words = ("render", tmp_path / "ball.ply", *"--width 33 --height 25 --fps 2 --seconds 1".split())
     run(*words)
     assert (tmp_path / "ball.mp4").stat().st_size > 500

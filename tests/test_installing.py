@@ -20,7 +20,7 @@ from refusing import refusal
 
 import pointsplat_ns as ps
 from lab import demo
-from lab.robustness.fuzz_readers import run_with_photos
+from lab.robustness.fuzz_readers import READERS
 from making import REPOSITORY, imports_of
 from pointsplat_ns.errors import MissingPackageError, need
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
@@ -80,7 +80,8 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
                 (packages / top).symlink_to(distribution.locate_file(top))
 
     ps.save(ps.prune(ps.example_room(), 200, by="coverage"), work / "room.ply")
-    run_with_photos(work / "run")
+    (work / "run").mkdir()
+    READERS["config"](work / "run")  # lays out a run with photos
 
     lines = [*RUNS, LACKS]
     environment = {

@@ -201,8 +201,8 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
 """
 
 
-def run_with_photos(folder: Path) -> None:
-    """A run of three photos."""
+def _run(folder: Path) -> None:
+    """A run with three photos."""
     for place in ("nerfstudio_models", "data/images"):
         (folder / place).mkdir(parents=True)
     (folder / "config.yml").write_bytes(CONFIG)
@@ -285,9 +285,9 @@ def _use_replica(path: Path) -> object:
 READERS |= {
     "refiner-metadata": _refiner_metadata,
     "weights": at("a.safetensors", "pointsplat_ns.refiner.feedback:read_feedback_refiner", inside=_with_zeros),
-    "config": at("config.yml", _use_run, run_with_photos),
+    "config": at("config.yml", _use_run, _run),
     "frame-of-run": at("dataparser_transforms.json", "pointsplat_ns.io.runs:read_transforms"),
-    "dataset": at("data/transforms.json", _use_dataset, run_with_photos),
+    "dataset": at("data/transforms.json", _use_dataset, _run),
     "camera-path": at("a.json", "pointsplat_ns.pages.camera_path:read_path"),
     "camera-json": at("a.json", "pointsplat_ns.io.camera_files:read_views", _transforms),
     "colmap-cameras": at("cameras.bin", _poses_in_folder, _colmap("bin")),

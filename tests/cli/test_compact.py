@@ -134,7 +134,7 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
     assert "next: " not in capsys.readouterr().out
 
 
-def test_what_cannot_be_used_is_refused_in_one_line_before_long_work(
+def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
     ply, helps, trained_walls, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours

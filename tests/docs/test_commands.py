@@ -22,7 +22,7 @@ OF_OTHERS = {"--decimate", "--no-build-isolation", "--only-binary", "--tyro-prin
 OTHERS = ("docker", "git", "npm", "pip", "pre-commit", "uv")
 """Programs of others, whose arguments nothing here reads."""
 
-CUT = 800
+CUT = 1500
 """Gaussians of the scene that commands are run on: enough to draw, few enough for a second each."""
 
 
@@ -104,7 +104,7 @@ def test_command_makes_the_room_small(command, cut_room, tmp_path, monkeypatch):
         errors = (ps.render(small, views) - ps.render(ps.load("room.ply"), views)).double().square().mean()
         assert errors < 10**-3.4  # 35 dB, and what the rounding of an SPZ adds
     else:
-        assert 0 < len(ps.load(output)) < CUT + bool({"--for", "0.1MB"} & {*words})  # all of it may fit
+        assert 0 < len(ps.load(output)) < CUT + bool({"--for"} & {*words})  # all of it may fit
     for option in ("--plot", "--picture"):
         assert option not in words or Path(words[words.index(option) + 1]).stat().st_size > 1000
 

@@ -36,7 +36,7 @@ def scenes_in(path: Path, folder: Path) -> list[Gaussians]:
     return scenes
 
 
-def test_page_names_nothing_outside_and_lets_only_its_own_scripts_run(written):
+def test_page_names_nothing_outside_of_itself_and_lets_only_its_own_scripts_run(written):
     names_nothing_outside(written)
     parts = parts_of(written)
     assert policy_of(parts) == {
@@ -131,7 +131,7 @@ def ball_seen_from(eyes: list[list[float]], targets: list[list[float]]) -> ps.Vi
     return ps.Views(viewmats, K, 64, 40, torch.tensor([1.0, 0.5, 0.0]), "antialiased")
 
 
-def test_flight_begins_with_the_whole_and_leads_to_the_given_views():
+def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
     scene = ball(300)
     views = ball_seen_from([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[12.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     stage = FlightFrame.of(scene, views)

@@ -10,7 +10,7 @@ import torch
 
 @contextmanager
 def broken(kind: str, places: Container[int]) -> Iterator[None]:
-    """Within, photos are ``nan`` or ``infinite``, or a ``gradient`` is NaN with a finite loss."""
+    """Within, photos are NaN or infinite, or a gradient is NaN with a finite loss."""
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
     from pointsplat_ns.nerfstudio_plugin.pointsplat.pipeline import PointSplatPipeline
 

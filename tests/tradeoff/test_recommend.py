@@ -23,7 +23,7 @@ def test_without_photos_the_loss_is_that_expected_of_renders(db, key):
     assert fastest_within(without, expected_loss(db)).key == key
 
 
-def test_the_smaller_of_two_as_fast_and_the_smallest_untimed_is_best():
+def test_of_two_as_fast_the_smaller_is_recommended_and_where_times_mean_nothing_the_fewest_gaussians():
     twin = replace(POINTS[3], key="twin", bytes=20)
     assert fastest_within([*POINTS, twin], 0.5).key == "twin"
     slow = replace(POINTS[1], key="few", frame_ms=1e6, gaussians=1)
