@@ -95,8 +95,9 @@ def test_command_makes_the_room_small(command, cut_room, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = command.words
     start(words, monkeypatch)
-    default = {"prune": "room_pruned.ply", "compact": "room_web.sog" if "--for" in words else "room_compact.ply"}
-    output = Path(words[words.index("-o") + 1] if "-o" in words else default[words[1]])
+    default = {"prune": "room_pruned.ply", "compact": "room_compact.ply"}[words[1]]
+    default = "room_web.sog" if "--for" in words else default
+    output = Path(words[words.index("-o") + 1] if "-o" in words else default)
     if "--dry-run" in words:
         assert not output.exists()
     elif "auto:35" in words:  # few Gaussians may all be needed
