@@ -7,26 +7,19 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+import quick_start.sitecustomize  # noqa: F401  (before nerfstudio)
 import torch
-from nerfstudio.configs import external_methods
 
-from making import SHARED_DATA
+from making import SHARED_DATA, ball, small_config
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.views import Views
+from replica_scenes import write_frames
 
-WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-WALL_DISTANCE = 2.0
-DEPTH_SCALE = 6553.5
-NUM_FRAMES = 11
-
-
-# nerfstudio lists the methods that others offer. For each of these 26 it looks at the stack, and searches all modules
-# for the sources of what runs: more than ten seconds.
-external_methods.get_external_methods = lambda: ({}, {})
+SEED = 20
+LPIPS_WEIGHTS = SHARED_DATA / "weights"
 
 
 def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -34,38 +27,19 @@ def wall_colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack([0.5 + 0.4 * np.sin(4 * x), 0.5 + 0.4 * np.cos(5 * y), 0.5 + 0.4 * np.sin(3 * x + 2 * y)], axis=-1)
 
 
-def write_wall(scene: Path, num_frames: int = NUM_FRAMES, width: int = WIDTH, height: int = HEIGHT) -> Path:
-    """Write exact photos, depth images and poses of a painted wall, in the Replica layout.
-
-    The cameras stand ``WALL_DISTANCE`` before the wall z = 0, look along +z and step sideways."""
-    (scene / "results").mkdir(parents=True)
-    cx, cy = (width - 1) / 2, (height - 1) / 2
-    camera = {"w": width, "h": height, "fx": FOCAL, "fy": FOCAL, "cx": cx, "cy": cy, "scale": DEPTH_SCALE}
-    (scene.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    poses = []
-    for i in range(num_frames):
-        x, y = 0.6 * np.cos(i), 0.4 * np.sin(2 * i)
-        colors = wall_colors(x + (u - cx) / FOCAL * WALL_DISTANCE, y + (v - cy) / FOCAL * WALL_DISTANCE)
-        photo = np.round(255 * colors).astype(np.uint8)
-        cv2.imwrite(str(scene / "results" / f"frame{i:06d}.png"), photo[..., ::-1])
-        depth = np.full((height, width), round(WALL_DISTANCE * DEPTH_SCALE), dtype=np.uint16)
-        cv2.imwrite(str(scene / "results" / f"depth{i:06d}.png"), depth)
-        pose = np.eye(4)
-        pose[:3, 3] = x, y, -WALL_DISTANCE
-        poses.append(" ".join(f"{value:.9g}" for value in pose.reshape(-1)))
-    (scene / "traj.txt").write_text("\n".join(poses) + "\n")
-    return scene
-
-
 @pytest.fixture(scope="session")
 def wall_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the painted wall; shared by all tests, so do not write to it."""
-    return write_wall(tmp_path_factory.mktemp("replica") / "wall")
-
-
-SEED = 20
-LPIPS_WEIGHTS = SHARED_DATA / "weights"
+    """Exact photos, depth images and poses of a painted wall, in the Replica layout; shared by all tests, so do not
+    write to it. The cameras stand 2 units before the wall z = 0, look along +z and step sideways."""
+    folder = tmp_path_factory.mktemp("replica")
+    width, height, focal, scale = 64, 48, 60.0, 6553.5
+    camera = {"w": width, "h": height, "fx": focal, "fy": focal, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": {**camera, "scale": scale}}))
+    places = np.array([(0.6 * math.cos(i), 0.4 * math.sin(2 * i), -2.0) for i in range(11)])
+    rays = np.stack(np.meshgrid(np.arange(width) - camera["cx"], np.arange(height) - camera["cy"])) / focal
+    walls = (wall_colors(*(place[:2, None, None] + 2 * rays)) for place in places)
+    photos = (np.round(255 * colors).astype(np.uint8) for colors in walls)
+    return write_frames(folder / "wall", photos, places, round(2 * scale))
 
 
 @pytest.fixture(scope="session")
@@ -159,17 +133,11 @@ def some_lpips(request, monkeypatch) -> bool:
 def make_refined_run() -> Callable:
     """A function that writes a pointsplat run as nerfstudio saves it, whose network adds ``moved`` to every opacity
     logit and nothing else, and gives its folder."""
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.config import pointsplat_config
     from pointsplat_ns.refiner import Refiner, preset
 
     def make(folder: Path, data: Path, eval_scenes: tuple[str, ...] = (), moved: float = 0.0, **model) -> Path:
-        config = pointsplat_config()
-        config.output_dir, config.experiment_name = folder, "refiner"
-        config.pipeline.datamanager.data = config.data = data
+        config = small_config(data, folder, 10, **model)
         config.pipeline.datamanager.eval_scenes = eval_scenes
-        for name, value in {"size": "tiny", "keep": 0.5, "by": "paper", **model}.items():
-            setattr(config.pipeline.model, name, value)
-        config.set_timestamp()
         config.save_config()
         torch.manual_seed(SEED)
         refiner = Refiner(preset("tiny"))
@@ -177,12 +145,9 @@ def make_refined_run() -> Callable:
             [*refiner.heads.mlps["opacities"].modules()][-1].bias.fill_(moved)
         state = {f"_model.refiner.{name}": value for name, value in refiner.state_dict().items()}
         # The rate of a cosine schedule is a numpy number, which torch refuses to load unless it is told otherwise.
-        schedules = {"encoder": {"_last_lr": [np.float64(0.1)]}}
+        state = {"step": 9, "pipeline": state, "schedulers": {"encoder": {"_last_lr": [np.float64(0.1)]}}}
         config.get_checkpoint_dir().mkdir()
-        torch.save(
-            {"step": 9, "pipeline": state, "optimizers": {}, "schedulers": schedules, "scalers": {}},
-            config.get_checkpoint_dir() / "step-000000009.ckpt",
-        )
+        torch.save(state | {"optimizers": {}, "scalers": {}}, config.get_checkpoint_dir() / "step-000000009.ckpt")
         return config.get_base_dir()
 
     return make
@@ -194,17 +159,9 @@ def make_hollow_ball() -> Callable[..., Gaussians]:
     far away."""
 
     def make(n: int = 1500, seed: int = 0, degree: int = 2) -> Gaussians:
-        generator = torch.Generator().manual_seed(seed)
-        place = torch.randn(n, 3, generator=generator)
-        place = 2 * place / place.norm(dim=1, keepdim=True)
-        scene = Gaussians(
-            means=place + torch.tensor([5.0, 0.0, 0.0]),
-            scales=torch.full((n, 3), math.log(0.12)) + 0.2 * torch.randn(n, 3, generator=generator),
-            quats=torch.randn(n, 4, generator=generator),
-            opacities=2 + torch.randn(n, 1, generator=generator),
-            features_dc=torch.sin(2 * place) + 0.3 * torch.randn(n, 3, generator=generator),
-            features_rest=0.03 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
-        )
+        scene = ball(n, degree, seed, math.log(0.12))
+        noise = 0.3 * torch.randn(n, 3, generator=torch.Generator().manual_seed(seed + 1))
+        scene = scene.replace(means=scene.means + torch.tensor([5.0, 0.0, 0.0]), features_dc=scene.features_dc + noise)
         scene.means[0] = 1e6
         return scene
 

@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -20,17 +21,11 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def made(monkeypatch) -> list[int]:
-    """Numbers of Gaussians of the scenes that were made, in this process."""
-    counts: list[int] = []
-    compact_scene = folders.compact_scene
-
-    def counted(dense, *given):
-        counts.append(len(dense))
-        return compact_scene(dense, *given)
-
+def made(monkeypatch) -> mock.Mock:
+    """What makes scenes small, in this process."""
+    counted = mock.Mock(wraps=folders.compact_scene)
     monkeypatch.setattr(folders, "compact_scene", counted)
-    return counts
+    return counted
 
 
 def settle(folder: Path, keep: str = "50%", **options) -> dict[str, ps.SceneResult]:
@@ -55,7 +50,8 @@ def test_what_is_finished_is_not_made_again_and_what_is_not_is(folder, made):
     second = settle(folder)
     statuses = {name: result.status for name, result in second.items()}
     assert statuses == {"a": "done before", "b": "done", "deep/c": "done"}
-    assert made == [60, 60, 60, 60, 80] and files(folder) == RESULTS | ABOUT
+    assert [len(call.args[0]) for call in made.mock_calls] == [60, 60, 60, 60, 80]
+    assert files(folder) == RESULTS | ABOUT
     assert second["a"].seconds == first["a"].seconds and second["a"].after == 30
     assert len(ps.load(second["deep/c"].output)) == 40
 
@@ -80,13 +76,8 @@ def test_a_damaged_record_or_description_is_never_believed(folder):
         settle(folder)
 
 
-def test_an_interruption_ends_it_all_and_leaves_whole_files(folder, made, monkeypatch):
-    def interrupted(*given):
-        if len(made) == 2:
-            raise KeyboardInterrupt
-        return read_back(*given)
-
-    read_back = folders.read_back
+def test_an_interruption_ends_it_all_and_leaves_whole_files(folder, monkeypatch):
+    interrupted = mock.Mock(side_effect=[mock.DEFAULT, KeyboardInterrupt], wraps=folders.read_back)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(folders, "read_back", interrupted)
         settle(folder)

@@ -1,5 +1,6 @@
 """Gaussians and views."""
 
+import dataclasses
 import math
 
 import pytest
@@ -15,7 +16,6 @@ from pointsplat_ns.views import Views
     ("name", "shape", "message"),
     [
         ("means", (5, 2), r"means has shape \(5, 2\); expected \(5, 3\)"),
-        ("scales", (4, 3), r"scales has shape \(4, 3\); expected \(5, 3\)"),
         ("opacities", (5,), r"opacities has shape \(5,\); expected \(5, 1\)"),
         ("features_rest", (5, 45), r"features_rest has shape \(5, 45\)"),
         ("features_rest", (5, 4, 3), "features_rest has 4 coefficients"),
@@ -46,8 +46,7 @@ def test_selection_takes_the_same_rows_of_every_parameter(index):
 
 def test_selecting_nothing_leaves_an_empty_scene_of_the_same_degree():
     empty = normal_scene(5, 2)[torch.zeros(5, dtype=torch.bool)]
-    assert len(empty) == 0 and empty.sh_degree == 2
-    assert len(Gaussians.empty(sh_degree=2)) == 0
+    assert (len(empty), empty.sh_degree) == (0, 2) and same(empty, Gaussians.empty(sh_degree=2))
     assert Gaussians.empty(1).usable().shape == (0,)
 
 
@@ -70,13 +69,13 @@ def test_usable_tells_meaningless_values_from_meaningful_ones(name, value):
     assert scene.replace(**{name: spoiled}).usable().tolist() == expected
 
 
-def make(count=5, width=64, height=48, mode="antialiased"):
-    """Cameras at x = 0, 1, 2... with focal length 50, 51, 52..."""
-    viewmats = torch.eye(4).repeat(count, 1, 1)
-    viewmats[:, 0, 3] = -torch.arange(float(count))
-    Ks = torch.tensor([[50.0, 0.0, 31.0], [0.0, 40.0, 25.0], [0.0, 0.0, 1.0]]).repeat(count, 1, 1)
-    Ks[:, 0, 0] += torch.arange(count)
-    return Views(viewmats, Ks, width, height, torch.tensor([0.1, 0.2, 0.3]), mode)
+def make(width=64, height=48):
+    """Five cameras at x = 0, 1, 2... with focal length 50, 51, 52..."""
+    viewmats = torch.eye(4).repeat(5, 1, 1)
+    viewmats[:, 0, 3] = -torch.arange(5.0)
+    Ks = torch.tensor([[50.0, 0.0, 31.0], [0.0, 40.0, 25.0], [0.0, 0.0, 1.0]]).repeat(5, 1, 1)
+    Ks[:, 0, 0] += torch.arange(5)
+    return Views(viewmats, Ks, width, height, torch.tensor([0.1, 0.2, 0.3]), "antialiased")
 
 
 def places(views):
@@ -86,19 +85,16 @@ def places(views):
 @pytest.mark.parametrize(
     ("index", "expected"),
     [
-        (slice(1, 3), [1.0, 2.0]),
         (slice(None, None, 2), [0.0, 2.0, 4.0]),
         (slice(2, 2), []),
         ([3, 0, 0], [3.0, 0.0, 0.0]),
-        ([2], [2.0]),
         (torch.tensor([4, 1]), [4.0, 1.0]),
         (torch.tensor([True, False, False, True, False]), [0.0, 3.0]),
     ],
 )
 def test_slices_lists_indices_and_masks_give_views(index, expected):
     some = make()[index]
-    assert isinstance(some, Views) and len(some) == len(expected)
-    assert places(some) == expected
+    assert isinstance(some, Views) and places(some) == expected
     assert (some.width, some.height, some.rasterize_mode) == (64, 48, "antialiased")
 
 
@@ -119,15 +115,13 @@ def test_resized_views_see_the_same_in_fewer_pixels():
     ("change", "message"),
     [
         ({"viewmats": torch.eye(4)}, r"viewmats .* \(4, 4\); expected \(\d, 4, 4\)"),
-        ({"viewmats": torch.zeros(5, 3, 4)}, r"viewmats .* \(5, 3, 4\); expected \(5, 4, 4\)"),
         ({"Ks": torch.zeros(4, 3, 3)}, r"Ks .* \(4, 3, 3\); expected \(5, 3, 3\)"),
         ({"background": torch.zeros(4)}, r"background .* \(4,\); expected \(3,\)"),
     ],
 )
 def test_a_shape_that_does_not_fit_is_named(change, message):
-    given = {name: getattr(make(), name) for name in ("viewmats", "Ks", "background")}
     with pytest.raises(DataError, match=message):
-        Views(**{**given, **change}, width=64, height=48)
+        dataclasses.replace(make(), **change)
 
 
 @pytest.mark.parametrize("size", [(0, 48), (64, 0)])

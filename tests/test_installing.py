@@ -14,13 +14,13 @@ from importlib import metadata
 from unittest import mock
 
 import pytest
-import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from refusing import refusal
 
 import pointsplat_ns as ps
 from lab import demo
+from lab.robustness.fuzz_readers import READERS
 from making import REPOSITORY, imports_of
 from pointsplat_ns.errors import MissingPackageError, need
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
@@ -34,25 +34,6 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["pro
 EXTRAS = PROJECT["optional-dependencies"]
 CORE, NERFSTUDIO = ([*map(Requirement, texts)] for texts in (PROJECT["dependencies"], EXTRAS["nerfstudio"]))
 
-WITH_ANOTHER = {"gsplat": "nerfstudio"}
-"""Packages that are imported where the one that brings them is."""
-
-BY_NAME = {"open3d"}
-"""Requirements that are imported nowhere: what another package needs of them is said here."""
-
-RUN_CONFIG = """\
-!!python/object:nerfstudio.engine.trainer.TrainerConfig
-data: photos
-experiment_name: kitchen
-method_name: splatfacto
-pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
-  datamanager: !!python/object:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanagerConfig
-    dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig {}
-  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
-    sh_degree: 3
-timestamp: run
-"""
-
 RUNS = {
     "--version": "pointsplat-ns",
     "info room.ply": "200 Gaussians",
@@ -62,7 +43,7 @@ RUNS = {
     "tradeoff room.ply --keep 10% --views 2 --resolution 64x48 --repairs none": "room_tradeoff",
     "convert room.ply room.sog": "200 Gaussians",
     "render room.ply room_pruned.ply -o film.mp4 --width 64 --height 48 --seconds 0.1 --fps 20": "2 frames",
-    "export run -o exported.ply": "100 Gaussians",
+    "export run -o exported.ply": "6 Gaussians",
     "render run -o run.png --width 64 --height 48": "reading the photos and poses of a run needs nerfstudio",
 }
 """Commands that nothing is missing for, and what they print."""
@@ -94,24 +75,17 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     for made in (packages, nothing, work):
         made.mkdir()
     for distribution in installed_for(CORE):
-        tops = {file.parts[0] for file in distribution.files or () if file.parts[0] not in ("..", "__pycache__")}
-        for top in tops:
+        for top in {file.parts[0] for file in distribution.files or ()} - {"..", "__pycache__"}:
             if not (packages / top).exists():
                 (packages / top).symlink_to(distribution.locate_file(top))
 
     ps.save(ps.prune(ps.example_room(), 200, by="coverage"), work / "room.ply")
-    (work / "photos").mkdir()
-    (work / "run" / "nerfstudio_models").mkdir(parents=True)
-    (work / "run" / "config.yml").write_text(RUN_CONFIG)
-    scene = ps.load(work / "room.ply")[:100]
-    content = {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in scene.items()}}
-    torch.save(content, work / "run" / "nerfstudio_models" / "step-000000009.ckpt")
+    (work / "run").mkdir()
+    READERS["config"](work / "run")  # lays out a run with photos
 
-    commands, results = folder / "commands.json", folder / "results.json"
     lines = [*RUNS, LACKS]
-    commands.write_text(json.dumps([shlex.split(line) for line in lines]))
     environment = {
-        "HOME": str(commands / "home"),  # below a file, nobody can make a folder
+        "HOME": str(work / "room.ply" / "home"),  # below a file, nobody can make a folder
         "PATH": str(nothing),
         "TMPDIR": str(folder),
         "CUDA_VISIBLE_DEVICES": "",
@@ -121,11 +95,11 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     }
     # -S: without the site-packages of this Python.
     done = subprocess.run(
-        [sys.executable, "-S", REPOSITORY / "tests" / "support" / "bare_machine.py", commands, results],
-        cwd=work, env=environment, capture_output=True, text=True,
+        [sys.executable, "-S", REPOSITORY / "tests" / "support" / "bare_machine.py"], cwd=work, env=environment,
+        input=json.dumps([*map(shlex.split, lines)]), capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    return dict(zip(lines, json.loads(results.read_text()), strict=True))
+    return dict(zip(lines, json.loads(done.stdout), strict=True))
 
 
 @pytest.mark.parametrize("line", RUNS)
@@ -143,19 +117,19 @@ def test_command_says_what_it_lacks_in_one_line(outcomes):
 
 def test_requirements_are_what_is_imported():
     core, more = ({canonicalize_name(requirement.name) for requirement in listed} for listed in (CORE, NERFSTUDIO))
-    package = REPOSITORY / "pointsplat_ns"
     plugin, rest = set(), set()
-    for path in (*package.rglob("*.py"), *(REPOSITORY / "method_configs").glob("*.py")):
-        imported = {name.split(".")[0] for name in imports_of(path)} - {"pointsplat_ns", "method_configs", "_typeshed"}
-        inside = path.is_relative_to(package / "nerfstudio_plugin") or not path.is_relative_to(package)
-        (plugin if inside else rest).update(imported - set(sys.stdlib_module_names))
+    for path in (*REPOSITORY.glob("pointsplat_ns/**/*.py"), *REPOSITORY.glob("method_configs/*.py")):
+        (plugin if {"nerfstudio_plugin", "method_configs"} & {*path.parts} else rest).update(imports_of(path))
     homes = metadata.packages_distributions()
+    ours = {"pointsplat_ns", "method_configs", "_typeshed", "gsplat", *sys.stdlib_module_names}  # gsplat: nerfstudio's
 
     def distributions(imported: set[str]) -> set[str]:
-        found = {canonicalize_name(name) for package in imported - WITH_ANOTHER.keys() for name in homes[package]}
+        tops = {name.split(".")[0] for name in imported} - ours
+        found = {canonicalize_name(name) for top in tops for name in homes[top]}
         return found - {"opencv-python"}  # shares its package with that without a window, which nerfstudio takes
 
-    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - BY_NAME
+    # open3d is imported nowhere: pyproject.toml says which of its versions nerfstudio can use
+    assert distributions(rest) <= core and distributions(plugin | rest) == (core | more) - {"open3d"}
 
 
 def test_the_demo_gives_its_first_result_and_then_says_what_it_lacks(monkeypatch, tmp_path):

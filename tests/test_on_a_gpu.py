@@ -12,6 +12,7 @@ from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.io import write_ply
+from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system.threads import fixed_threads
@@ -21,21 +22,21 @@ NEAR = 1e-4
 """Difference of colours in [0, 1] in float32 between compiled kernels, which the CPU uses, and torch."""
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def several_threads():
-    """More than one thread for pieces of work, whatever the environment says."""
-    with fixed_threads(4):
+    """More than one thread for pieces of work, whatever the environment says; views are sampled from few."""
+    with fixed_threads(4), changed({"candidates_per_view": 1, "min_candidates": 4, "evidence_count": 100}):
         yield
 
 
 @pytest.fixture(scope="module")
 def room():
-    return box_room(0, count=400, size=0.1)
+    return box_room(0, count=200, size=0.14)
 
 
 @pytest.fixture(scope="module")
-def views(room):
-    return ps.sample_views(room, 3, width=48, height=36)
+def views(room, several_threads):
+    return ps.sample_views(room, 3, width=32, height=24)
 
 
 def check(gpu) -> None:
@@ -102,7 +103,7 @@ def test_every_method_keeps_the_same_gaussians_on_a_gpu(by, room, views):
 
 def test_views_are_sampled_of_a_scene_on_a_gpu_as_on_the_cpu(room, views):
     with pretend_gpu() as gpu:
-        found = ps.sample_views(room.to(GPU), 3, width=48, height=36)
+        found = ps.sample_views(room.to(GPU), 3, width=32, height=24)
     check(gpu)
     assert torch.equal(found.viewmats, views.viewmats) and torch.equal(found.Ks, views.Ks)
 
@@ -119,7 +120,7 @@ def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, views, t
         refined = ps.compact(room, 0.5, ps.load_refiner(tmp_path / "small.safetensors"), effort="instant", views=views)
     check(gpu)
     assert len(gpu.operations) > 1000, "renders, and steps of the repair"
-    assert len(refined.scene) == 200
+    assert len(refined.scene) == 100
     assert len(found.scene) == len(wanted.scene) and {stage.scene.device for stage in found.stages} == {room.device}
     for ours, right in zip(found.stages, wanted.stages, strict=True):
         assert ours.name == right.name and abs(ours.after.psnr - right.after.psnr) < 0.1  # dB
@@ -143,7 +144,7 @@ def test_trainings_take_the_same_steps_on_a_gpu_from_one_thread(
         return run_training(config)[1]
 
     rooms = tmp_path / "rooms"
-    write_ply(box_room(0, count=300, size=0.1), rooms / "room.ply")
+    write_ply(box_room(0, count=150, size=0.16), rooms / "room.ply")
     wanted = losses_on(torch.device("cpu"))
     with pretend_gpu() as gpu:
         found = losses_on(GPU)

@@ -3,27 +3,12 @@
 Without compiled kernels, two threads add up gradients in another order than one.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import pytest
-import torch
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
 from pointsplat_ns.pruning.methods import METHODS
-
-FORMATS = ("ply", "spz", "sog", "splat")
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+from pointsplat_ns.system.threads import fixed_threads
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +18,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def looks(room):
-    return ps.sample_views(room, 3, width=48, height=36)
+    return ps.sample_views(room, 2, width=32, height=24)
 
 
 @pytest.mark.parametrize("by", METHODS)
@@ -41,17 +26,17 @@ def test_a_scene_is_made_small_to_the_same_bits_on_one_thread_and_on_two(by, roo
     views = looks if METHODS[by].needs_views else None
     first = ps.prune(room, 0.3, by=by, views=views)
     assert same_bits(first, ps.prune(room, 0.3, by=by, views=views))
-    with threads(2):
+    with fixed_threads(2):
         assert same_bits(first, ps.prune(room, 0.3, by=by, views=views))
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", ("ply", "spz", "sog", "splat"))
 def test_a_file_has_the_same_bytes_again_on_one_thread_and_on_two(suffix, room, tmp_path):
     written = []
     for number, count in enumerate((1, 1, 2)):
         folder = tmp_path / str(number)  # a format may hold the name of its file
         folder.mkdir()
-        with threads(count):
+        with fixed_threads(count):
             ps.save(room, folder / f"room.{suffix}")
         written.append((folder / f"room.{suffix}").read_bytes())
     assert written[0] == written[1] == written[2] and len(written[0]) > 10_000

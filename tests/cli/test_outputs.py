@@ -48,9 +48,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("name", WRITES)
-def test_what_is_interrupted_while_it_is_written_is_not_there_and_what_was_there_stays(
-    name, tmp_path, monkeypatch, capsys
-):
+def test_an_interrupted_write_leaves_nothing_new_and_what_was_there_stays(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     ps.save(ball(40, opacity=1.0, bright=1.0), "room.ply")
     Path(name).write_text("from before")

@@ -5,30 +5,31 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
+from quick_looking import QUICK
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "quickstart.ipynb"
 
-SMALLER = """
+SMALLER = f"""
 import pointsplat_ns as ps
 from pointsplat_ns import api
 from pointsplat_ns.compression import repair
+from pointsplat_ns.looking import settings, view_source
 
-ps.save(ps.prune(ps.example_room(), 3000, by="coverage"), "room.ply")
-api.EXAMPLE, repair.STEPS["quick"] = "room.ply", 2
+ps.save(ps.example_room()[::30], "room.ply")
+api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
+settings.changed({QUICK}).__enter__()
 """
-"""Run before all cells: the scene that ships cut to a tenth, and a repair of two steps."""
-
-CELL_TIMEOUT = 300
-"""Seconds, for a machine that is busy with other things; an idle core runs all cells in less."""
+"""Run before all cells: the scene that ships cut to a thirtieth, a repair of two steps, few and small views."""
 
 
 def test_notebook_shows_three_pictures_and_says_what_compacting_brought(tmp_path, monkeypatch):
-    """In a folder of its own, on one thread."""
+    """In a folder of its own, on one thread; 300 seconds are for a machine that is busy."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path))
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(SMALLER))
     resources = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=CELL_TIMEOUT, kernel_name="python3", resources=resources).execute()
+    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
     said = "".join(output.text for output in outputs if output.output_type == "stream")

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 import pointsplat_ns as ps
 from documented import BLOCKS, ROOT
@@ -71,30 +70,25 @@ def room() -> ps.Gaussians:
     return ball(4, opacity=1.0, bright=1.0)
 
 
-def cut() -> None:
-    Path("room.ply").write_bytes(Path("room.ply").read_bytes()[:-7])
+def write(name: str, change: Callable[[bytes], bytes]) -> Callable[[], object]:
+    """A function that writes a file with the bytes of the room changed."""
+    return lambda: Path(name).write_bytes(change(Path("room.ply").read_bytes()))
 
 
-def flat() -> None:
-    data = Path("room.ply").read_bytes().replace(b"property float scale_2\n", b"property float unknown\n")
-    Path("flat.ply").write_bytes(data)
-
-
-def odd() -> None:
+def odd(data: bytes) -> bytes:
     """One position that is no number."""
-    data = Path("room.ply").read_bytes()
-    at = data.index(b"end_header\n") + len(b"end_header\n")
-    Path("room.ply").write_bytes(data[:at] + torch.tensor([torch.nan]).numpy().tobytes() + data[at + 4 :])
+    head, end, rows = data.partition(b"end_header\n")
+    return head + end + b"\0\0\xc0\x7f" + rows[4:]
 
 
 TRIGGERS: dict[str, tuple[Callable[[], object], str]] = {
     "no such file; expected a scene": (lambda: Path("room.ply").unlink(), "info room.ply"),
-    "truncated": (cut, "info room.ply"),
+    "truncated": (write("room.ply", lambda data: data[:-7]), "info room.ply"),
     "exists already": (lambda: Path("room_pruned.ply").touch(), "prune room.ply"),
     "cannot write a RAD": (room, "convert room.ply room.rad"),
     "a folder without config.yml": (lambda: Path("rooms").mkdir(), "lod rooms"),
-    "2D Gaussians": (flat, "info flat.ply"),
-    "dropped 1 of 4": (odd, "convert room.ply other.ply"),
+    "2D Gaussians": (write("flat.ply", lambda data: data.replace(b"scale_2\n", b"unknown\n")), "info flat.ply"),
+    "dropped 1 of 4": (write("room.ply", odd), "convert room.ply other.ply"),
     "not a Splatfacto run": (room, "convert room.ply other.ply --original-frame"),
     "keep is 'half'": (room, "prune room.ply --keep half"),
     "did you mean": (lambda: ps.save(ps.example_room(), "room.ply", overwrite=True), "prune room.ply --keep 10"),

@@ -1,15 +1,14 @@
 """The demo: the scene that ships made small, then every command of the method once."""
 
-import importlib.metadata
 import json
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 
+from documented import start
 from lab import demo as module
 from making import ball, write_run
-from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io import read_ply, write_ply
 
@@ -29,14 +28,10 @@ def programs(monkeypatch) -> list[str]:
     ran: list[str] = []
 
     def run(about: str, words: list, log: Path) -> None:
-        program, *rest = words = [str(word) for word in words]
-        ran.append(" ".join(words[:2]) if program == "ns-train" else program)
-        with log.open("w") as stream, redirect_stdout(stream), monkeypatch.context() as patch:
-            if program == "pointsplat":
-                return main(rest)  # its program ends the process
-            [script] = importlib.metadata.entry_points(group="console_scripts", name=program)
-            patch.setattr("sys.argv", words)
-            script.load()()
+        words = tuple(map(str, words))
+        ran.append(" ".join(words[: 1 + (words[0] == "ns-train")]))
+        with log.open("w") as stream, redirect_stdout(stream):
+            start(words, monkeypatch)
 
     monkeypatch.setattr(module, "run", run)
     return ran

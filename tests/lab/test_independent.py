@@ -4,25 +4,11 @@ import numpy as np
 
 import pointsplat_ns as ps
 from lab import independent
-from making import box_room
-from pointsplat_ns.gaussians import Gaussians
-
-
-def uneven(room: Gaussians) -> Gaussians:
-    """The room with Gaussians of different sizes, opacities and colours that depend on the direction."""
-    rng = np.random.default_rng(5)
-
-    def noise(*shape):
-        return room.means.new_tensor(rng.normal(size=shape))
-
-    n = len(room)
-    rest = 0.2 * noise(n, 15, 3)
-    scales, opacities = room.scales + 0.5 * noise(n, 3), room.opacities + noise(n, 1)
-    return room.replace(features_rest=rest, scales=scales, opacities=opacities, quats=noise(n, 4))
+from making import ball
 
 
 def test_the_package_agrees_with_a_recomputation_of_its_own(tmp_path, capsys):
-    ps.save(uneven(box_room(0, 300)), tmp_path / "room.ply")
+    ps.save(ball(300, 3), tmp_path / "room.ply")
     lines = independent.main(tmp_path / "room.ply", views=3, width=48)
     assert "dual-branch encoder's output" in capsys.readouterr().out
     for what, count, median, largest, kept in lines:
@@ -33,7 +19,7 @@ def test_the_package_agrees_with_a_recomputation_of_its_own(tmp_path, capsys):
 
 
 def test_the_recomputation_notices_another_definition(monkeypatch, tmp_path):
-    ps.save(uneven(box_room(0, 300)), tmp_path / "room.ply")
+    ps.save(ball(300, 3), tmp_path / "room.ply")
     mine = independent.read_ply(tmp_path / "room.ply")
     by_scales = independent.pup_hessians
     monkeypatch.setattr(  # by standard deviations, as the package had it once

@@ -1,16 +1,48 @@
-"""lab/judge: the camera paths that ship, what is measured in their views, and rows that are kept."""
+"""lab/judge: the camera paths that ship, what programs measure in their views, and rows that are kept."""
 
+import dataclasses
 import json
+import statistics
 from pathlib import Path
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
-from lab.judge import camera_paths, judge, levels, record, scenes
+from lab.common.programs import Usage, run_measured
+from lab.judge import ablation, camera_paths, cleaning, judge, levels, record, refiners, scenes
+from lab.judge import bytes as equal_bytes
+from making import box_room, move_zero_layers, run_of
 from peers import peer
+from pointsplat_ns.cli import main
+from pointsplat_ns.io import read_scene, write_ply
+from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.merging import MERGING, merge
+from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
 PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
+
+
+VIEWS = {
+    "scene": "small",
+    "about": "The walls of a room, from its middle.",
+    "up": [0, 0, 1],
+    "field_of_view": 60,
+    "views": [{"eye": [0.2, 0.1, 0], "at": [2, 0, 0]}, {"eye": [0, 0, 0.3], "at": [0, 1.5, 0]}],
+}
+
+
+@pytest.fixture()
+def small(tmp_path, monkeypatch) -> Path:
+    """A room of 900 Gaussians with a path of two views."""
+    monkeypatch.setattr(camera_paths, "FOLDER", tmp_path)
+    (tmp_path / "small.json").write_text(json.dumps(VIEWS))
+    write_ply(box_room(seed=3), tmp_path / "small.ply")
+    return tmp_path / "small.ply"
+
+
+def rows_of(results: Path) -> list[dict]:
+    return json.loads(results.read_text())["rows"]
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
@@ -40,34 +72,26 @@ def test_every_way_has_a_row_for_each_width(small, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"small.ply", "small.json", "rows.json", "peer-3.7.0"}
 
 
-FAILS = """#!/bin/sh
-case "$*" in *--version*) echo "splat-transform v2.0.0";; *) echo "out of memory" >&2; exit 3;; esac
-"""
-
-
 def test_a_way_that_fails_is_noted_and_measured_again(small, tmp_path, capsys):
-    results, broken = tmp_path / "rows.json", tmp_path / "broken"
-    broken.write_text(FAILS)
-    broken.chmod(0o755)
+    results, broken = tmp_path / "rows.json", peer(tmp_path, "2.0.0", fails="--decimate")
     options = {"keep": (0.5,), "ways": (), "widths": (32,), "views": 1, "lpips": False, "json_path": results}
-    judge.main((small,), **options, splat_transform=(str(broken), peer(tmp_path, "2.7.1")))
+    judge.main((small,), **options, splat_transform=(broken, peer(tmp_path, "2.7.1")))
     said = capsys.readouterr().out
-    failed, fine = json.loads(results.read_text())["rows"]
-    assert failed["method"] == "splat-transform 2.0.0" and "out of memory" in failed["failed"]
+    failed, fine = rows_of(results)
+    assert failed["method"] == "splat-transform 2.0.0" and "out of luck" in failed["failed"]
     assert failed["covered_psnr"] is failed["seconds"] is None and fine["covered_psnr"] > 0
     assert "splat-transform 2.0.0 at 50 % failed" in said
-    mended = Path(peer(tmp_path, "2.0.0"))
-    judge.main((small,), **options, resume=True, splat_transform=(str(mended),))
-    rows = json.loads(results.read_text())["rows"]
+    judge.main((small,), **options, resume=True, splat_transform=(peer(tmp_path, "2.0.0"),))
+    rows = rows_of(results)
     assert [row["failed"] for row in rows] == ["", ""] and rows[1] == fine
 
 
 def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp_path, capsys):
     results = tmp_path / "rows.json"
-    [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
+    run = run_of(trained_walls, "wall-a")
     options = {"keep": (0.5,), "ways": (), "views": 2, "lpips": False, "json_path": results}
     judge.main((run,), **options, splat_transform=(peer(tmp_path, "2.7.1"),))
-    [row] = json.loads(results.read_text())["rows"]
+    [row] = rows_of(results)
     assert (row["scene"], row["at"], row["views"]) == ("wall-a", "photos", 2)
     assert 0 < row["photo_psnr"] < 100 and row["photo_psnr"] != row["dense_psnr"]
     assert "photo PSNR" in " ".join(capsys.readouterr().out.split())
@@ -95,3 +119,102 @@ def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_
     assert [(row["way"], row["count"]) for row in rows] == [(w, n) for w in ("its level", "prune") for n in (360, 180)]
     assert all(row["worst_64"] < row["mean_64"] < 60 for row in rows)
     assert "900 Gaussians" in capsys.readouterr().out
+
+
+TWO = ("no_regrouping", "growth_0")
+
+
+def test_each_field_of_merging_is_changed_by_some_variant():
+    changed = {field for found in ablation.VARIANTS.values() for field in found}
+    known = vars(MERGING) | vars(LOOKING)
+    assert vars(MERGING).keys() <= changed <= known.keys()
+    for name, found in ablation.VARIANTS.items():
+        assert any(known[field] != value for field, value in found.items()), name
+
+
+def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
+    results = tmp_path / "rows.json"
+    ablation.main((small,), keep=(0.2,), variants=TWO, views=2, width=64, json_path=results)
+    rows = rows_of(results)
+    assert [row["method"] for row in rows] == ["default", *TWO]
+    scene = scenes.load(small, (64,), 2)
+    for row, changes in zip(rows, ({}, {"regrouping_rounds": 0}, {"growth_exponent": 0.0}), strict=True):
+        merged = merge(read_scene(small), 180, settings=dataclasses.replace(MERGING, **changes)).scene
+        [(_, _, expected)] = scenes.losses(scene, [merged], None)
+        assert row["covered_psnr"] == expected["covered_psnr"]
+        assert (row["at"], row["keep"], row["gaussians"], row["changes"]) == (64, 0.2, 900, changes)
+        assert row["cpu_seconds"] > 0
+    assert len({row["covered_psnr"] for row in rows}) == 3
+    said = capsys.readouterr().out
+    assert all(name in said for name in TWO) and "| 20 % |" in said
+
+
+def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, tmp_path):
+    torch.manual_seed(0)
+    about = {"by": "opacity", "keep": "0.5"}
+    save_refiner(Refiner(preset("tiny")), tmp_path / "untrained.safetensors", about)
+    save_refiner(move_zero_layers(Refiner(preset("tiny"))), tmp_path / "moved.safetensors", about)
+    asked = tuple(f"{name}={tmp_path / name}.safetensors" for name in ("untrained", "moved"))
+    options = {"keep": (0.5, 0.25), "by": ("opacity",), "width": 64, "views": 2}
+    refiners.main((small,), asked, **options, json_path=tmp_path / "rows.json")
+    rows = rows_of(tmp_path / "rows.json")
+    wanted = [(name, keep, 900 * keep) for keep in (0.5, 0.25) for name in ("untrained", "moved")]
+    assert [(row["method"], row["keep"], row["count"]) for row in rows] == wanted
+    assert rows[0]["psnr"] == rows[0]["pruned_psnr"] == rows[1]["pruned_psnr"] != rows[1]["psnr"]
+    scene = scenes.load(small, (64,), 2)
+    pruned = ps.prune(scene.dense, keep=0.5, by="opacity")
+    [(_, _, expected)] = scenes.losses(scene, [pruned], None)
+    assert rows[0]["pruned_psnr"] == expected["covered_psnr"]
+
+
+def test_gains_are_means_over_scenes_and_their_spread_is_over_trainings():
+    gains = {("a", 0): 1.0, ("a", 1): 2.0, ("b", 0): 3.0, ("b", 1): 6.0}  # dB, by scene and training
+    common = {"method": "dual", "by": "paper", "keep": 0.1, "pruned_psnr": 20.0}
+    rows = [common | {"scene": scene, "number": number, "psnr": 20 + g} for (scene, number), g in gains.items()]
+    rows.append({**common, "scene": "a", "method": "concat", "number": 2, "psnr": 19.5})
+    spread = f"{statistics.stdev([2.0, 4.0]):.2f}"
+    assert refiners.lines(rows) == [
+        ["dual", "paper", "10 %", "2", "+3.00", spread],
+        ["concat", "paper", "10 %", "1", "-0.50", "-"],
+    ]
+
+
+def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):
+    cleaning.main([run_of(trained_walls, "wall-a")], strengths=(0.0, 1.0), photos=2, side=32)
+    lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
+    none, most = ([cell.strip() for cell in line] for line in lines)
+    assert none[:3] == ["0", "0.00", "+0.000"] and most[0] == "1" and float(most[1]) >= 0
+
+
+def run_here(args: list[str]) -> Usage:
+    """Run in this process what would import torch in one of its own: our command, and splat-transform's conversion."""
+    if args[1] == "-c":
+        main(args[3:])
+    elif len(args) == 6:
+        ps.save(ps.load(args[4]), args[5])
+    else:
+        return run_measured(args)
+    return Usage(1.0, 1.0, 1)
+
+
+def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
+    found = tmp_path / "found.json"
+    monkeypatch.setattr(equal_bytes, "run_measured", run_here)
+
+    def measure(**options: object) -> list[dict]:
+        equal_bytes.main(
+            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
+            width=48, json_path=found, **options,
+        )  # fmt: skip
+        return rows_of(found)
+
+    rows = measure(picture=tmp_path / "found.png")
+    assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
+    ours, peers = rows
+    assert 7200 <= ours["bytes"] <= 8000 and 7700 <= peers["bytes"] <= 8000 and ours["count"] > peers["count"]
+    [[lead]] = equal_bytes.leads(rows).to_numpy()
+    assert lead == pytest.approx(ours["covered_psnr"] - peers["covered_psnr"])
+    assert f"{lead:+.1f} small" in capsys.readouterr().out
+
+    monkeypatch.setattr(equal_bytes, "run_measured", lambda *_: pytest.fail("measured again"))
+    assert measure(resume=True) == rows

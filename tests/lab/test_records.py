@@ -1,30 +1,44 @@
 """Records of the lab against its programs."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
 
-from lab.judge import bytes as judge_of_bytes
-from lab.judge import record, tables_record
+from lab.judge import ablation, record, tables_record
+from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
+from lab.training import with_photos
 from making import box_room
 from peers import peer
 from pointsplat_ns.io import write_ply
+from pointsplat_ns.looking.settings import changed
+from quick_looking import USUAL
 
-RECORD = Path(__file__).parents[2] / "docs" / "record"
+JUDGED = RECORD / "judge.json", RECORD / "judge_photos.json"
+
+PAGES = {
+    "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD / "encoders.json"),
+    "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
+    "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
+    "with_photos.md": lambda: with_photos.page(record.read([RECORD / "with_photos.json"], "with_photos.py")[0]),
+    "judge.md": lambda: record.page(*record.read(JUDGED)),
+}
 
 
-def test_page_is_what_the_program_writes_from_the_rows():
-    written = tables_record.page(tables_record.read(RECORD / "results.json"), RECORD / "encoders.json")
-    assert written == (RECORD / "results.md").read_text("utf-8")
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_of_the_record_is_what_its_program_writes_from_the_rows(name):
+    with changed(USUAL):
+        assert PAGES[name]() == (RECORD / name).read_text("utf-8")
 
 
-def test_the_page_of_times_is_what_the_program_writes_from_the_rows():
-    rows = json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]
-    assert beside.page(rows) == (RECORD / "speed.md").read_text("utf-8")
+def test_the_table_of_the_readme_is_that_of_the_record_which_is_small():
+    assert all(path.stat().st_size < 200_000 for path in JUDGED)
+    rows, _ = record.read(JUDGED)
+    readme = record.ROOT / "README.md"
+    text = readme.read_text("utf-8")
+    assert record.put_between(text, record.readme_table(rows), readme) == text
 
 
 def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(monkeypatch, tmp_path, capsys):
@@ -67,39 +81,3 @@ def test_variants_are_timed_with_their_errors(tmp_path, capsys):
     assert case["errors"]["eager max"] == 0 < case["errors"]["fast max"] and 20 < case["errors"]["fast PSNR"] < 80
     assert 32 * 24 * 300 > case["pairs"] > case["visible"] > 0 and 300 >= case["visible"]
     assert "fast / eager" in capsys.readouterr().out
-
-
-def test_the_record_that_is_committed_is_small_and_its_tables_are_up_to_date():
-    folder = record.ROOT / "docs" / "record"
-    files = [folder / "judge.json", folder / "judge_photos.json"]
-    assert all(path.stat().st_size < 200_000 for path in files)
-    rows, settings = record.read(files)
-    assert (folder / "judge.md").read_text("utf-8") == record.page(rows, settings)
-    readme = record.ROOT / "README.md"
-    text = readme.read_text("utf-8")
-    assert record.put_between(text, record.readme_table(rows), readme) == text
-
-
-def test_files_of_equal_sizes_are_compared_and_drawn(small, tmp_path, monkeypatch, capsys):
-    found = tmp_path / "found.json"
-
-    def measure(**options: object) -> list[dict]:
-        judge_of_bytes.main(
-            (small,), (0.008,), ("prune .spz", "splat-transform .spz"), peer(tmp_path, "3.7.0"),
-            width=48, json_path=found, **options,
-        )  # fmt: skip
-        return json.loads(found.read_text())["rows"]
-
-    rows = measure(picture=tmp_path / "found.png")
-    assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
-    ours, peers = rows
-    assert 7200 <= ours["bytes"] <= 8000 and 7700 <= peers["bytes"] <= 8000 and ours["count"] > peers["count"]
-    [[lead]] = judge_of_bytes.leads(rows).to_numpy()
-    assert lead == pytest.approx(ours["covered_psnr"] - peers["covered_psnr"])
-    assert f"{lead:+.1f} small" in capsys.readouterr().out
-
-    def unused(*arguments: object) -> None:
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(judge_of_bytes, "run_measured", unused)
-    assert measure(resume=True) == rows

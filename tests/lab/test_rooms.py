@@ -5,6 +5,7 @@ import functools
 import json
 import logging
 import os
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -18,8 +19,6 @@ from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_de
 
 pytestmark = pytest.mark.xdist_group("rooms")  # one worker computes the light of each room for all tests of this file
 
-WIDTH, HEIGHT = 96, 72
-
 room_of = functools.cache(make_room)
 """The room of a seed. Its light, which takes seconds, is computed once for all tests here."""
 
@@ -32,36 +31,14 @@ def coarser_light():
         yield
 
 
-@pytest.fixture(scope="module")
-def room():
-    return room_of(3)
-
-
-@pytest.fixture(scope="module")
-def poses(room):
-    return capture_path(room, 40, 3)
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory, coarser_light):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lab.rooms.write.make_room", room_of)
-        return write_room(
-            tmp_path_factory.mktemp("rooms") / "room1", seed=1, frames=6, width=64, height=48, progress=False
-        )
-
-
-def picture(room, pose):
-    return render_room(room, pose, default_intrinsics(WIDTH, HEIGHT), WIDTH, HEIGHT)
-
-
-def test_a_seed_gives_the_same_room_path_and_picture_and_another_seed_another(room, poses):
-    again = make_room(3)
-    assert torch.equal(again.solids.center, room.solids.center)
-    assert torch.equal(capture_path(again, 40, 3), poses)
-    first, second = picture(room, poses[5]), picture(again, poses[5])
-    assert torch.equal(first[0], second[0]) and torch.equal(first[1], second[1])
-    assert make_room(7).size != room.size
+def test_a_seed_gives_the_same_room_path_and_picture_and_another_another():
+    rooms = room_of(3), make_room(3)
+    assert torch.equal(*(room.solids.center for room in rooms))
+    assert torch.equal(*(capture_path(room, 40, 3) for room in rooms))
+    pose = capture_path(rooms[0], 40, 3)[5]
+    pictures = [render_room(room, pose, default_intrinsics(96, 72), 96, 72) for room in rooms]
+    assert all(torch.equal(one, other) for one, other in zip(*pictures, strict=True))
+    assert room_of(1).size != rooms[0].size
 
 
 def clearance(room, points):
@@ -88,7 +65,9 @@ def test_cameras_keep_clear_of_furniture_move_smoothly_and_look_level():
         assert float(poses[:, 2, 3].max() - poses[:, 2, 3].min()) > 0.25
 
 
-def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written, caplog):
+def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("lab.rooms.write.make_room", room_of)
+    written = write_room(tmp_path / "room1", seed=1, frames=6, width=64, height=48, progress=False)
     with caplog.at_level(logging.WARNING):
         scene = load_replica(written)
     assert not caplog.records
@@ -105,7 +84,7 @@ def test_a_written_room_reads_back_as_a_replica_scene_without_a_warning(written,
     assert np.abs(read_photo(scene.photos[2], scene.params) / 255.0 - rgb.numpy()).mean() < 0.012  # JPEG at 97
 
 
-def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp_path, coarse_rooms, monkeypatch):
+def test_writing_that_fails_leaves_nothing_behind_and_keeps_what_is_there(tmp_path, coarse_rooms, monkeypatch):
     target = tmp_path / "room"
     target.mkdir()
     (target / "mine.txt").write_text("kept")
@@ -113,25 +92,11 @@ def test_writing_leaves_nothing_behind_when_it_fails_and_keeps_what_is_there(tmp
         write_room(target, 0, 2, 16, 12, progress=False)
     assert (target / "mine.txt").read_text() == "kept"
 
-    def full(*args, **kwargs):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Image.Image, "save", full)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(Image.Image, "save", mock.Mock(side_effect=full))
     with pytest.raises(DataError, match="other: cannot be written .No space left on device."):
         write_room(tmp_path / "other", 0, 2, 16, 12, progress=False)
     assert [p.name for p in tmp_path.iterdir()] == ["room"]
-
-
-def room_with(*rows):
-    """A 6 x 6 x 3 room and the given (center, half, round)."""
-    center, half, round = zip(((0, 0, 1.5), (3, 3, 1.5), False), *rows, strict=True)
-    return Solids(
-        torch.tensor(center), torch.tensor(half), torch.tensor(round), torch.ones(len(half), dtype=torch.bool)
-    )
-
-
-def ray(origin, direction):
-    return torch.tensor(origin).float()[:, None], torch.tensor(direction).float()[:, None]
 
 
 @pytest.mark.parametrize(
@@ -146,6 +111,8 @@ def ray(origin, direction):
     ],
 )
 def test_first_hit_equals_the_analytic_distance(solid, origin, direction, expected):
-    t, index = trace(room_with(solid), *ray(origin, direction))
+    center, half, round = zip(((0, 0, 1.5), (3, 3, 1.5), False), solid, strict=True)  # in a room of 6 x 6 x 3
+    solids = Solids(*map(torch.tensor, (center, half, round)), torch.ones(2, dtype=torch.bool))
+    t, index = trace(solids, *(torch.tensor(given).float()[:, None] for given in (origin, direction)))
     assert float(t) == pytest.approx(expected, abs=2e-6)  # float32 at distances of metres
     assert int(index) == (0 if expected == 5.0 else 1)

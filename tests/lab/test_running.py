@@ -58,7 +58,6 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
     ("scene", "below", "parser", "dataset"),
     [
         ("0a5c013435", "", "scannetpp_dataparser.ScanNetppDataParserConfig", "ScanNet++"),
-        ("0a5c013435", "dslr", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
         ("0a5c013435", "dslr/colmap", "colmap_dataparser.ColmapDataParserConfig", "ScanNet++"),
         ("0a5c013435", "", "nerfstudio_dataparser.NerfstudioDataParserConfig", ""),
         ("fox", "", "scannetpp_dataparser.ScanNetppDataParserConfig", ""),
@@ -83,15 +82,9 @@ def test_scannetpp_is_known_by_the_names_of_its_scenes(scene, below, parser, dat
     ],
 )
 def test_differences_from_the_papers_protocol_are_named(monkeypatch, change, differs):
-    case = {"seen": 3, "side": 64, "scale": 1.0, "downscale": None, "sh_degree": 3, "step": 14_999, "masks": False}
-    case |= change
-    known = SimpleNamespace(
-        folder=Path("run"),
-        data=None,
-        step=case["step"],
-        datamanager_fields={"camera_res_scale_factor": case["scale"]},
-        dataparser_fields={"downscale_factor": case["downscale"]},
-    )
+    case = {"seen": 3, "side": 64, "downscale": None, "sh_degree": 3, "step": 14_999, "masks": False} | change
+    fields = {"datamanager_fields": {}, "dataparser_fields": {"downscale_factor": case["downscale"]}}
+    known = SimpleNamespace(folder=Path("run"), data=None, step=case["step"], **fields)
     photo = SimpleNamespace(mask=torch.ones(1) if case["masks"] else None)
     monkeypatch.setattr(scenes, "run_photos", lambda *_: [photo] * 3)
     assert differences(known, case["sh_degree"], case["seen"], (case["side"], 64)) == differs

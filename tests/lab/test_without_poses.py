@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from plyfile import PlyData
 
 import pointsplat_ns as ps
@@ -15,7 +14,7 @@ from captures import FRAMES, HEIGHT, OPENCV_TO_OPENGL, WIDTH, Capture, Lens
 from lab.common.scenes import group_of
 from lab.judge import captures, without_poses
 from lab.judge.scenes import load, losses
-from making import box_room
+from making import box_room, run_of
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
@@ -33,7 +32,7 @@ def test_captures_are_named_for_one_purpose_and_rooms_are_among_both():
         assert 25 <= found.count <= 300 and len(found.commit) == 40 and found.repository.count("/") == 1
 
 
-def ready(made: Capture, clone: Path, target: Path, known: captures.Capture, side: int) -> list[dict]:
+def ready(clone: Path, target: Path, known: captures.Capture, side: int) -> list[dict]:
     assert captures.prepare(known, clone, target, side) == FRAMES
     frames = json.loads((target / "transforms.json").read_text())["frames"]
     assert len(frames) == FRAMES
@@ -52,7 +51,7 @@ def test_poses_of_a_json_have_opengl_axes_and_scaled_intrinsics(opencv, tmp_path
         frame["transform_matrix"] = (pose @ (OPENCV_TO_OPENGL if opencv else np.eye(4))).tolist()
     (clone / "transforms.json").write_text(json.dumps(content))
     known = dataclasses.replace(KNOWN, opencv=opencv)
-    frames = ready(made, clone, tmp_path / "ready", known, WIDTH // 2)
+    frames = ready(clone, tmp_path / "ready", known, WIDTH // 2)
     for frame, pose in zip(frames, made.poses, strict=True):
         assert np.allclose(frame["transform_matrix"], pose)
         assert (frame["w"], frame["h"]) == (WIDTH // 2, HEIGHT // 2)
@@ -62,12 +61,9 @@ def test_poses_of_a_json_have_opengl_axes_and_scaled_intrinsics(opencv, tmp_path
 def test_photos_of_a_colmap_model_become_pinhole_pictures(tmp_path):
     bent = Capture(BENT)
     names = bent.write_photos(tmp_path / "clone/images")
-    bent.write_colmap(tmp_path / "text", names)
-    model = tmp_path / "clone/sparse"
-    model.mkdir()
-    colmap.write_model(*colmap.read_model(str(tmp_path / "text"), ".txt"), str(model), ".bin")
+    bent.write_colmap(tmp_path / "clone/sparse", names, suffix=".bin")
     known = dataclasses.replace(KNOWN, poses="sparse")
-    frames = ready(bent, tmp_path / "clone", tmp_path / "ready", known, WIDTH)
+    frames = ready(tmp_path / "clone", tmp_path / "ready", known, WIDTH)
     for frame, photo in zip(frames, bent.photos, strict=True):
         # The same wall, seen by a pinhole camera of the intrinsics that were written.
         lens = Lens(focal=(frame["fl_x"], frame["fl_y"]), center=(frame["cx"], frame["cy"]))
@@ -86,18 +82,10 @@ def test_a_clone_of_another_repository_is_refused(tmp_path):
     assert not (tmp_path / "ready").exists()
 
 
-@pytest.fixture(scope="module")
-def measured(trained_walls, tmp_path_factory) -> tuple[Path, Path]:
-    """A tiny trained run, and the file of what was measured of it."""
-    [run] = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
-    results = tmp_path_factory.mktemp("rows") / "rows.json"
-    without_poses.main((run,), keep=(0.5,), views=2, json_path=results)
-    return run, results
-
-
-def test_every_way_and_set_of_views_has_a_row(measured):
-    run, results = measured
-    rows = json.loads(results.read_text())["rows"]
+def test_every_way_and_set_of_views_has_a_row(trained_walls, tmp_path):
+    run = run_of(trained_walls, "wall-a")
+    without_poses.main((run,), keep=(0.5,), views=2, json_path=tmp_path / "rows.json")
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
     ways = [(row["method"], row["views"]) for row in rows]
     assert ways == [(way, name) for way in ("prune", "compact") for name in without_poses.SETS]
     scene, poses = load(run, (), 2), dataset_views(run, "train")

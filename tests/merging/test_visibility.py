@@ -93,7 +93,7 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
         assert found.tolist() == [1.0] * 400
 
 
-def test_traces_count_where_the_scene_tells_of_its_photos_and_fog_has_no_views(monkeypatch):
+def test_traces_count_where_a_scene_tells_of_photos_and_fog_has_no_views(monkeypatch):
     monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, *_: torch.full((len(rows),), 0.5))
     monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0))
     settings = replace(MERGING, sampled_views=2, min_count_rendered=0)

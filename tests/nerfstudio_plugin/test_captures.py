@@ -142,7 +142,7 @@ def numbers(outputs: DataparserOutputs) -> list[int]:
     return [int(path.stem) for path in outputs.image_filenames]
 
 
-def test_bad_frames_are_left_out_of_both_splits_with_their_masks_and_cameras(scene):
+def test_bad_frames_leave_both_splits_with_their_masks_and_cameras(scene):
     for split, wanted in (("train", set(range(FRAMES)) - set(HELD_OUT)), ("test", set(HELD_OUT))):
         ours, every = parsed(scene, split), ScanNetppDataParserConfig(data=scene).setup().get_dataparser_outputs(split)
         assert numbers(ours) == sorted(wanted - set(BAD)) and len(numbers(every)) == len(numbers(ours)) + 1

@@ -130,7 +130,7 @@ def test_scene_is_chosen_or_dropped_and_shown(browser, tmp_path):
         assert said == []
 
 
-def test_button_and_key_turn_the_scene_through_all_axes_and_name_the_one_that_is_up(browser):
+def test_button_and_key_turn_through_all_axes_and_name_the_one_that_is_up(browser):
     guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
     for up, first in ((None, "up: +z, a guess"), ("z", "up: +z")):
         with pytest.MonkeyPatch.context() as patch:

@@ -105,7 +105,7 @@ def test_a_scene_in_the_frame_of_nerfstudio_needs_no_file_that_says_so(scene, vi
     assert "oriented, centred and scaled as nerfstudio does" in said.text
 
 
-def test_applied_and_dataparser_transforms_are_undone_where_the_scene_does_not_have_them(scene, views, tmp_path, said):
+def test_applied_and_dataparser_transforms_that_a_scene_lacks_are_undone(scene, views, tmp_path, said):
     """Each is a turn that is no turn of axes."""
     folder = write_photos(scene, views, tmp_path / "images")
     angle = torch.tensor(0.7)
@@ -187,7 +187,7 @@ def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, mo
     assert small.training[0].target.shape == (24, 32, 3) and (small.views.width, small.views.height) == (32, 24)
 
 
-def test_a_scene_that_gsplat_normalised_is_found_by_the_points_of_the_model(scene, views, tmp_path, said):
+def test_a_scene_that_gsplat_normalised_is_found_by_the_models_points(scene, views, tmp_path, said):
     """Axes of the points of any signs: turns of axes find the rest."""
     folder = write_photos(scene, views, tmp_path / "images")
     model = write_colmap_text(views, tmp_path / "sparse/0")

@@ -1,9 +1,9 @@
 """Runs ``pointsplat`` commands one after another in this process, cut off from the network, and writes what each did.
 
-    python bare_machine.py COMMANDS.json RESULTS.json
+    python bare_machine.py < COMMANDS.json
 
-The first file is a list of command lines, each a list of words. The second is a list of what each printed, its exit
-status and the hosts that it tried to reach. Views are as small as in the other tests.
+A command is a list of words; of each are said what it printed, its exit status and the hosts that it tried to reach.
+Views are as small as in the other tests.
 """
 
 import io
@@ -11,7 +11,6 @@ import json
 import sys
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
-from pathlib import Path
 
 from pointsplat_ns.looking.settings import changed
 from quick_looking import QUICK
@@ -27,12 +26,11 @@ def no_network(event: str, arguments: tuple) -> None:
 
 
 def outcome(words: list[str]) -> dict:
-    """What a command did."""
     from pointsplat_ns.cli import main
 
     tried.clear()
-    out, err, status = io.StringIO(), io.StringIO(), 0
-    with redirect_stdout(out), redirect_stderr(err):
+    status = 0
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
         try:
             main(words)
         except SystemExit as end:
@@ -48,6 +46,5 @@ if __name__ == "__main__":
     from pointsplat_ns.looking import view_source
 
     view_source.RESOLUTION = (64, 48)
-    commands, results = map(Path, sys.argv[1:])
     with changed(QUICK):
-        results.write_text(json.dumps([outcome(words) for words in json.loads(commands.read_text("utf-8"))]))
+        print(json.dumps([outcome(words) for words in json.load(sys.stdin)]))

@@ -12,9 +12,6 @@ import pytest
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
-PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-
-
 SECONDS = 90
 """How long a test waits for what shall come; it takes a few on an idle machine."""
 
@@ -23,18 +20,17 @@ SECONDS = 90
 def chromium() -> "Iterator[Chrome]":
     """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is missing."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
-    driver = shutil.which("chromedriver")
-    if program is None or driver is None:
+    programs = filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")))
+    options, driver = selenium.ChromeOptions(), shutil.which("chromedriver")
+    options.binary_location = next(programs, "")
+    if not options.binary_location or driver is None:
         pytest.skip("no Chromium with chromedriver on the path, so no page can be opened")
-    options = selenium.ChromeOptions()
-    options.binary_location = program
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    arguments = ("--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900")
-    for argument in (*arguments, "--enable-unsafe-swiftshader"):  # WebGL without a GPU
+    arguments = ["--headless=new", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1200,900"]
+    arguments += ["--enable-unsafe-swiftshader"]  # WebGL without a GPU
+    arguments += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []  # Chromium has none for root
+    for argument in arguments:
         options.add_argument(argument)
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        options.add_argument("--no-sandbox")  # Chromium has none for root
     browser = selenium.Chrome(options=options, service=selenium.ChromeService(driver))
     try:
         yield browser

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from nerfstudio.data.utils import colmap_parsing_utils as colmap
+from plys import write_columns
 from scipy.spatial.transform import Rotation
 
+from posing import write_colmap
+
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
-HALF_SIZE = np.array([1.6, 1.3, 1.0])
-"""Half the sides of the room, about the origin; z is up."""
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SEEDS = 300
 HIDDEN = np.s_[30:42, 10:26]
@@ -65,8 +65,9 @@ def colors_at(points: np.ndarray) -> np.ndarray:
 
 def seen_from(eye: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Where rays (..., 3) from within the room meet its walls, (..., 3)."""
+    half_size = np.array([1.6, 1.3, 1.0])  # of the room, about the origin; z is up
     with np.errstate(divide="ignore"):
-        lengths = (np.sign(directions) * HALF_SIZE - eye) / directions
+        lengths = (np.sign(directions) * half_size - eye) / directions
     return eye + directions * lengths.min(axis=-1, keepdims=True)
 
 
@@ -74,7 +75,7 @@ class Capture:
     """Photos of the room by one lens. Poses (N, 4, 4) are camera-to-world in OpenGL axes, as nerfstudio's."""
 
     def __init__(self, lens: Lens | None = None):
-        self.lens = Lens() if lens is None else lens
+        self.lens = lens or Lens()
         rng = np.random.default_rng(11)
         turns = np.linspace(0, 2 * math.pi, FRAMES, endpoint=False)
         self.poses = np.tile(np.eye(4), (FRAMES, 1, 1))
@@ -110,47 +111,30 @@ class Capture:
         ]
         meta = {**self.lens.transforms, "ply_file_path": "points.ply", "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(meta))
-        kinds = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-        header = ["ply", "format ascii 1.0", f"element vertex {SEEDS}", *kinds, "end_header"]
-        rows = [
-            " ".join([*map(str, xyz), *map(str, rgb)])
-            for xyz, rgb in zip(self.seeds.tolist(), self.seed_colors.tolist(), strict=True)
-        ]
-        (folder / "points.ply").write_text("\n".join([*header, *rows, ""]))
+        columns = dict(zip("xyz", self.seeds.T.astype(np.float32), strict=True))
+        columns |= dict(zip(("red", "green", "blue"), self.seed_colors.T, strict=True))
+        write_columns(folder / "points.ply", columns, text=True)
         return folder
 
-    def write_colmap(self, model: Path, names: list[str], to_colmap: np.ndarray | None = None) -> None:
-        """COLMAP's text files of the poses and seeds."""
-        move = np.eye(4) if to_colmap is None else to_colmap
-        model.mkdir(parents=True)
-        numbers = " ".join(map(str, (*self.lens.focal, *self.lens.center, *self.lens.distortion)))
-        (model / "cameras.txt").write_text(f"1 {self.lens.model} {WIDTH} {HEIGHT} {numbers}\n")
-        lines = []
-        for number, (name, pose) in enumerate(zip(names, self.poses, strict=True), 1):
-            viewmat = np.linalg.inv(move @ pose @ OPENCV_TO_OPENGL)
-            pose_of = [*colmap.rotmat2qvec(viewmat[:3, :3]), *viewmat[:3, 3]]
-            lines += [f"{number} {' '.join(map(str, pose_of))} 1 {name}", ""]
-        (model / "images.txt").write_text("\n".join(lines) + "\n")
+    def write_colmap(self, model: Path, names: list[str], move: np.ndarray | None = None, suffix: str = ".txt") -> None:
+        """COLMAP's files of the poses and seeds, moved by a rigid matrix (4, 4)."""
+        move = np.eye(4) if move is None else move
+        lens = self.lens.model, WIDTH, HEIGHT, [*self.lens.focal, *self.lens.center, *self.lens.distortion]
+        viewmats = np.linalg.inv(move @ self.poses @ OPENCV_TO_OPENGL)
         seeds = self.seeds @ move[:3, :3].T + move[:3, 3]
-        rows = [
-            " ".join(map(str, [number, *xyz, *rgb, 0.5, 1, 0, 2, 0]))
-            for number, (xyz, rgb) in enumerate(zip(seeds.tolist(), self.seed_colors.tolist(), strict=True), 1)
-        ]
-        (model / "points3D.txt").write_text("\n".join(rows) + "\n")
+        write_colmap(model, suffix, lens, dict(zip(names, viewmats, strict=True)), seeds, self.seed_colors)
 
     def write_scannetpp(self, folder: Path) -> Path:
         """ScanNet++'s dslr/ folder: masks over what is not to be seen, one bad frame in each split, COLMAP's model in
         a frame of its own."""
         names = self.write_photos(folder / "dslr/resized_images")
         (folder / "dslr/resized_anon_masks").mkdir()
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[HIDDEN] = 0
         frames = []
         for number, (name, pose) in enumerate(zip(names, self.poses, strict=True)):
             photo = folder / "dslr/resized_images" / name
-            spoilt = cv2.imread(str(photo))
-            spoilt[HIDDEN] = (255, 0, 255)
-            cv2.imwrite(str(photo), spoilt)
-            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-            mask[HIDDEN] = 0
+            cv2.imwrite(str(photo), np.where(mask[..., None] > 0, cv2.imread(str(photo)), np.uint8([255, 0, 255])))
             cv2.imwrite(str(folder / "dslr/resized_anon_masks" / name), mask)
             frame = {"file_path": name, "mask_path": name, "transform_matrix": pose.tolist()}
             frames.append({**frame, "is_bad": number in BAD})
@@ -160,7 +144,6 @@ class Capture:
         (folder / "dslr/nerfstudio").mkdir()
         (folder / "dslr/nerfstudio/transforms.json").write_text(json.dumps(meta))
         moved = np.eye(4)
-        moved[:3, :3] = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
-        moved[:3, 3] = 3.0, -2.0, 0.5
+        moved[:3] = np.c_[Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), [3.0, -2.0, 0.5]]
         self.write_colmap(folder / "dslr/colmap", names, moved)
         return folder

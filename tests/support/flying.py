@@ -17,12 +17,17 @@ PATIENCE = 60.0
 may take one."""
 
 
+def until(browser, condition: str) -> None:
+    """Wait until a script's expression is true."""
+    end = time.monotonic() + PATIENCE
+    while not browser.execute_script(f"return {condition}"):
+        assert time.monotonic() < end, f"not {condition}; it says {message(browser)!r}"
+        time.sleep(0.02)
+
+
 def settle(browser) -> None:
     """Wait until the picture does not change any more."""
-    end = time.monotonic() + PATIENCE
-    while not browser.execute_script("return flight.still"):
-        assert time.monotonic() < end, f"still moving; it says {message(browser)!r}"
-        time.sleep(0.02)
+    until(browser, "flight.still")
 
 
 def message(browser) -> str:
@@ -33,10 +38,7 @@ def message(browser) -> str:
 def shrink(browser, width: int = 192) -> None:
     """Give the picture a width in pixels: drawing takes long without a GPU."""
     browser.execute_script("flight.part.stage.style.width = `${arguments[0]}px`", width)
-    end = time.monotonic() + PATIENCE
-    while browser.execute_script("return flight.canvas.width") != width:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(browser, f"flight.canvas.width == {width}")
     settle(browser)
 
 

@@ -33,32 +33,13 @@ class Golden:
     background: tuple[float, ...] | None = None
     principal: tuple[float, float] = (13.5, 8.4)
     focal: tuple[float, float] = (24.0, 25.0)
-    change: Callable[[dict[str, Tensor]], None] = field(default=lambda scene: None)
+    change: Callable[[Tensor, Tensor, Tensor], dict] = field(default=lambda means, scales, opacities: {})
 
 
-def _needles(scene: dict[str, Tensor]) -> None:
-    scene["scales"][:, 0], scene["scales"][:, 1:] = 2.0, 1e-3
-
-
-def _opaque(scene: dict[str, Tensor]) -> None:
-    scene["opacities"][:] = 1.0
-    scene["scales"] *= 2.5
-
-
-def _below_a_pixel(scene: dict[str, Tensor]) -> None:
-    scene["scales"] *= 0.1
-    scene["opacities"][:] = 1.0
-
-
-def _large_and_faint(scene: dict[str, Tensor]) -> None:
-    scene["scales"] *= 8
-    scene["opacities"] *= 0.3
-
-
-def _around_the_camera(scene: dict[str, Tensor]) -> None:
-    scene["means"][::2, 2] -= 2.9  # some behind it, some before the near plane, some beside the field of view
-    scene["scales"] *= 0.5
-
+ONES = torch.ones(COUNT, dtype=torch.float64)
+NEEDLE = torch.tensor([2.0, 1e-3, 1e-3], dtype=torch.float64).repeat(COUNT, 1)
+BEHIND = torch.tensor([[0.0, 0.0, -2.9], [0.0, 0.0, 0.0]], dtype=torch.float64).repeat(COUNT // 2, 1)
+"""Half are moved: some behind the camera, some before the near plane, some beside the field of view."""
 
 SCENES = {
     "colours": Golden(0, sh_degree=None),
@@ -68,13 +49,21 @@ SCENES = {
     "degree 3 with expected depth": Golden(4, render_mode="RGB+ED", background=(0.2, 0.3, 0.4)),
     "seven channels": Golden(5, sh_degree=None, channels=7, background=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)),
     "antialiased": Golden(6, mode="antialiased"),
-    "antialiased below a pixel": Golden(7, mode="antialiased", change=_below_a_pixel),
-    "needles": Golden(8, sh_degree=1, change=_needles),
-    "opaque": Golden(9, sh_degree=1, background=(1.0, 1.0, 1.0), change=_opaque),
-    "large and faint": Golden(10, sh_degree=2, mode="antialiased", change=_large_and_faint),
-    "around the camera": Golden(
-        11, sh_degree=None, principal=(30.0, -4.0), focal=(15.0, 22.0), change=_around_the_camera
+    "antialiased below a pixel": Golden(
+        7, mode="antialiased", change=lambda _, s, __: {"scales": 0.1 * s, "opacities": ONES}
     ),
+    "needles": Golden(8, sh_degree=1, change=lambda *_: {"scales": NEEDLE}),
+    "opaque": Golden(9, 1, background=(1.0, 1.0, 1.0), change=lambda _, s, __: {"scales": 2.5 * s, "opacities": ONES}),
+    "large and faint": Golden(
+        10, 2, mode="antialiased", change=lambda _, s, o: {"scales": 8 * s, "opacities": 0.3 * o}
+    ),
+    "around the camera": Golden(
+        11,
+        None,
+        principal=(30.0, -4.0),
+        focal=(15.0, 22.0),
+        change=lambda m, s, _: {"means": m + BEHIND, "scales": 0.5 * s},
+    ),  # fmt: skip
 }
 
 
@@ -88,10 +77,10 @@ def made(name: str) -> dict[str, Tensor]:
         return torch.from_numpy(random.standard_normal(shape))
 
     depth = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    coefficients = (0 if golden.sh_degree is None else golden.sh_degree) + 1
-    colors = torch.rand(0) if golden.sh_degree is None else 0.3 * normal(COUNT, coefficients**2, 3)
     if golden.sh_degree is None:
         colors = torch.from_numpy(random.uniform(size=(COUNT, golden.channels)))
+    else:
+        colors = 0.3 * normal(COUNT, (golden.sh_degree + 1) ** 2, 3)
     scene = {
         "means": normal(COUNT, 3) * torch.tensor([0.9, 0.6, 0.5], dtype=torch.float64) + depth,
         "quats": normal(COUNT, 4),
@@ -99,28 +88,28 @@ def made(name: str) -> dict[str, Tensor]:
         "opacities": torch.from_numpy(random.uniform(0.2, 0.98, COUNT)),
         "colors": colors,
     }
-    golden.change(scene)
-    angle = 0.15
-    view = torch.eye(4, dtype=torch.float64)
-    view[0, 0] = view[2, 2] = math.cos(angle)
-    view[0, 2], view[2, 0] = math.sin(angle), -math.sin(angle)
-    view[:3, 3] = torch.tensor([-0.4, 0.05, 0.1], dtype=torch.float64)
-    K = torch.eye(3, dtype=torch.float64)
-    K[0, 0], K[1, 1] = golden.focal
-    K[0, 2], K[1, 2] = golden.principal
+    scene |= golden.change(scene["means"], scene["scales"], scene["opacities"])
+    cos, sin = math.cos(0.15), math.sin(0.15)
+    rows = [[cos, 0.0, sin, -0.4], [0.0, 1.0, 0.0, 0.05], [-sin, 0.0, cos, 0.1], [0.0, 0.0, 0.0, 1.0]]
+    view = torch.tensor(rows, dtype=torch.float64)
+    (fx, fy), (cx, cy) = golden.focal, golden.principal
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return {name: value.float().double() for name, value in {**scene, "viewmat": view, "K": K}.items()}
 
 
-def total(renders: Tensor, alphas: Tensor) -> Tensor:
-    """A sum over the image whose gradients are kept; neither symmetric nor of one sign."""
-    both = torch.cat([renders, alphas], dim=-1)
+def with_gradients(image: Tensor, alphas: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Image (H, W, channels) and alphas (H, W, 1), and gradients of a sum over both that is neither symmetric nor of
+    one sign; float64 on the CPU."""
+    both = torch.cat([image, alphas], dim=-1)
     weights = torch.cos(torch.arange(both.numel(), dtype=torch.float64)).view(both.shape)
-    return (both * weights.to(both)).sum()
+    grads = torch.autograd.grad((both * weights.to(both)).sum(), [*leaves.values()], materialize_grads=True)
+    found = {"image": image, "alphas": alphas} | dict(zip((f"grad of {name}" for name in NAMES), grads, strict=True))
+    return {name: value.detach().to("cpu", torch.float64) for name, value in found.items()}
 
 
 @functools.cache
 def drawn_by_reference(name: str) -> dict[str, Tensor]:
-    """Of one of :data:`SCENES` image (H, W, channels), alphas (H, W, 1) and gradients of :func:`total`, float64."""
+    """One of :data:`SCENES` as :func:`with_gradients`, by the reference."""
     golden, scene = SCENES[name], made(name)
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
     image, alphas, depths = rasterize_reference(
@@ -133,9 +122,7 @@ def drawn_by_reference(name: str) -> dict[str, Tensor]:
         image = torch.cat([image, depths], dim=-1)
     if golden.render_mode == "RGB+ED":
         image = torch.cat([image, depths / alphas.clamp_min(1e-10)], dim=-1)
-    grads = torch.autograd.grad(total(image, alphas), list(leaves.values()), materialize_grads=True)
-    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
-    return {"image": image.detach(), "alphas": alphas.detach(), **of_names}
+    return with_gradients(image, alphas, leaves)
 
 
 def drawn(name: str, dtype: torch.dtype, device: torch.device | str = "cpu", **options) -> dict[str, Tensor]:
@@ -149,10 +136,7 @@ def drawn(name: str, dtype: torch.dtype, device: torch.device | str = "cpu", **o
         WIDTH, HEIGHT, sh_degree=golden.sh_degree, backgrounds=background, render_mode=golden.render_mode,
         rasterize_mode=golden.mode, **options,
     )  # fmt: skip
-    grads = torch.autograd.grad(total(renders[0], alphas[0]), list(leaves.values()), materialize_grads=True)
-    of_names = {f"grad of {name}": grad for name, grad in zip(NAMES, grads, strict=True)}
-    found = {"image": renders[0], "alphas": alphas[0], **of_names}
-    return {name: value.detach().to("cpu", torch.float64) for name, value in found.items()}
+    return with_gradients(renders[0], alphas[0], leaves)
 
 
 def compare(found: dict[str, Tensor], wanted: dict[str, Tensor], image: float, gradient: float) -> None:

@@ -15,19 +15,14 @@ class Parts(HTMLParser):
         super().__init__()
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.inside: dict[str, list[str]] = {"script": [], "style": []}
-        self._open: str | None = None
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
-        self._open = tag if tag in self.inside else None
-
-    def handle_endtag(self, tag):
-        self._open = None
 
     def handle_data(self, data):
-        if self._open:
-            self.inside[self._open].append(data)
+        if self.cdata_elem:  # within a script or a style
+            self.inside[self.cdata_elem].append(data)
 
     @property
     def data(self) -> dict:
@@ -35,7 +30,6 @@ class Parts(HTMLParser):
 
 
 def parts_of(path: Path) -> Parts:
-    """The parts of a file."""
     return Parts(path.read_text("utf-8"))
 
 
@@ -47,7 +41,7 @@ def policy_of(parts: Parts) -> dict[str, str]:
 
 def hashed(text: str) -> str:
     """The source in a policy that allows one inline script or style."""
-    return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() + "'"
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def names_nothing_outside(path: Path) -> None:

@@ -26,7 +26,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 """Real captures, splats and weights that tests read in place; they skip where it is absent."""
 
-
 QUICK_START = REPOSITORY / "tests" / "support" / "quick_start"
 """First on the path of programs of nerfstudio that need not list the methods of others."""
 
@@ -39,13 +38,10 @@ def quick_start() -> dict[str, str]:
 
 def imports_of(path: Path) -> set[str]:
     """Every module or name that a file imports, wherever in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    nodes = [*ast.walk(ast.parse(path.read_text("utf-8")))]
+    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    froms = (node for node in nodes if isinstance(node, ast.ImportFrom))
+    return modules | {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -67,11 +63,11 @@ def equal(a: object, b: object) -> bool:
 
 def assert_same_on_any_threads(function: Callable[[], Sequence[torch.Tensor]]) -> None:
     """Fail unless the tensors that a function gives have the same bits on one thread, two and five."""
-    results = []
-    for threads in (1, 2, 5):
+    with fixed_threads(1):
+        wanted = function()
+    for threads in (2, 5):
         with fixed_threads(threads):
-            results.append(function())
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+            assert all(torch.equal(a, b) for a, b in zip(wanted, function(), strict=True))
 
 
 def normal_scene(n: int = 5, degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -94,37 +90,25 @@ def splats(means: torch.Tensor, scales, logits, colours=0.0, quats=(1.0, 0.0, 0.
 def cloud(n: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
     """``n`` random Gaussians in a unit cube."""
     g = torch.Generator().manual_seed(seed)
-    rest = (sh_degree + 1) ** 2 - 1
-    return Gaussians(
-        means=torch.rand(n, 3, generator=g),
-        scales=-3 + 0.5 * torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        opacities=torch.randn(n, 1, generator=g),
-        features_dc=torch.randn(n, 3, generator=g),
-        features_rest=0.1 * torch.randn(n, rest, 3, generator=g),
-    )
+    means = torch.rand(n, 3, generator=g)
+    shapes = (n, 3), (n, 4), (n, 1), (n, 3), (n, (sh_degree + 1) ** 2 - 1, 3)
+    scales, quats, opacities, colours, rest = (torch.randn(shape, generator=g) for shape in shapes)
+    return Gaussians(means, 0.5 * scales - 3, quats, opacities, colours, 0.1 * rest)
 
 
 def ball(
     n: int, degree: int = 1, seed: int = 0, log_size: float = math.log(0.25), opacity: float = 2.0, bright: float = 0.0
 ) -> Gaussians:
     """The inside of a ball of radius 2, covered with coloured blobs."""
-    generator = torch.Generator().manual_seed(seed)
-    place = torch.randn(n, 3, generator=generator)
-    place = 2 * place / place.norm(dim=1, keepdim=True)
-    return Gaussians(
-        means=place,
-        scales=torch.full((n, 3), log_size) + 0.2 * torch.randn(n, 3, generator=generator),
-        quats=torch.randn(n, 4, generator=generator),
-        opacities=opacity + torch.randn(n, 1, generator=generator),
-        features_dc=bright + torch.sin(2 * place),
-        features_rest=0.05 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=generator),
-    )
+    g = torch.Generator().manual_seed(seed)
+    shapes = (n, 3), (n, 3), (n, 4), (n, 1), (n, (degree + 1) ** 2 - 1, 3)
+    means, scales, quats, opacities, rest = (torch.randn(shape, generator=g) for shape in shapes)
+    means = 2 * means / means.norm(dim=1, keepdim=True)
+    colours = bright + torch.sin(2 * means)
+    return Gaussians(means, log_size + 0.2 * scales, quats, opacity + opacities, colours, 0.05 * rest)
 
 
-class Bomb:
-    """An object that prints when it is unpickled as usual."""
-
+class Bomb:  # prints when it is unpickled as usual
     def __reduce__(self):
         return (print, ("this must never be printed",))
 
@@ -159,47 +143,35 @@ def box_room(seed: int, count: int = 900, size: float = 0.15, smooth: bool = Fal
 
 
 def splats_in_view(
-    n: int,
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-    scale: float = -3.0,
-    spread: float = 0.8,
-    opacity: float = 1.0,
+    n: int, seed: int = 0, dtype=torch.float64, scale: float = -3.0, spread: float = 0.8, opacity: float = 1.0
 ) -> list[torch.Tensor]:
     """What a rasterizer takes, before the camera of :func:`camera_askew`: means (N, 3), quats (N, 4), scales (N, 3),
     opacities (N,) and SH of degree 3 (N, 16, 3)."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def randn(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    means = randn(n, 3) * torch.tensor([1.0, 1.0, 0.5], dtype=torch.float64) + torch.tensor([0, 0, 3.0]).double()
-    scales = torch.exp(randn(n, 3) * spread + scale)
-    opacities = torch.rand(n, generator=generator, dtype=torch.float64) * opacity
-    return [value.to(dtype) for value in (means, randn(n, 4), scales, opacities, randn(n, 16, 3) * 0.3)]
+    random = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
+    means = torch.randn(n, 3, **random) * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor([0.0, 0.0, 3.0])
+    scales = torch.exp(torch.randn(n, 3, **random) * spread + scale)
+    opacities = torch.rand(n, **random) * opacity
+    quats, sh = torch.randn(n, 4, **random), 0.3 * torch.randn(n, 16, 3, **random)
+    return [value.to(dtype) for value in (means, quats, scales, opacities, sh)]
 
 
-def camera_askew(
-    dtype: torch.dtype = torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0
-) -> tuple[torch.Tensor, torch.Tensor]:
+def camera_askew(dtype=torch.float64, angle: float = 0.2, cx: float = 20.0, cy: float = 13.0, focal: float = 40.0):
     """World-to-camera matrix (4, 4), turned by ``angle`` radians and moved a little, and intrinsics (3, 3) in pixels
     whose principal point is not the middle of any usual image."""
-    K = torch.tensor([[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]], dtype=dtype)
-    view = torch.eye(4, dtype=dtype)
     c, s = math.cos(angle), math.sin(angle)
-    view[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=dtype)
-    view[:3, 3] = torch.tensor([0.1, -0.1, 0.2], dtype=dtype)
-    return view, K
+    view = [[c, 0, s, 0.1], [0, 1, 0, -0.1], [-s, 0, c, 0.2], [0, 0, 0, 1]]
+    K = [[focal, 0, cx], [0, 1.05 * focal, cy], [0, 0, 1]]
+    return torch.tensor(view, dtype=dtype), torch.tensor(K, dtype=dtype)
 
 
 def small_refiner(trained: bool = True, seed: int = 0, **changes):
     """A refiner of two stages in evaluation mode; ``trained`` moves the zero layers, so that residuals are not zero."""
     from pointsplat_ns.refiner import Refiner, preset
 
-    encoder = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2)}
-    decoder = {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "patch": 32, "head_width": 16}
+    sizes = {"strides": (2,), "enc_channels": (16, 16), "enc_depths": (1, 1), "enc_heads": (2, 2), "patch": 32}
+    sizes |= {"dec_channels": (16,), "dec_depths": (1,), "dec_heads": (2,), "head_width": 16}
     torch.manual_seed(seed)
-    refiner = Refiner(preset("tiny", **{**encoder, **decoder, **changes})).eval()
+    refiner = Refiner(preset("tiny", **sizes | changes)).eval()
     return move_zero_layers(refiner) if trained else refiner
 
 
@@ -207,8 +179,8 @@ def small_refiner(trained: bool = True, seed: int = 0, **changes):
 def move_zero_layers(refiner):
     """The refiner, the last layers of whose heads, zero before training, are now random."""
     for mlp in refiner.heads.mlps.values():
-        mlp[-1].weight.normal_(std=0.1)
-        mlp[-1].bias.normal_(std=0.1)
+        for value in mlp[-1].parameters():
+            value.normal_(std=0.1)
     return refiner
 
 
@@ -245,7 +217,6 @@ def dense_config(data: Path, output_dir: Path, steps: int):
 @contextmanager
 def views_sampled_once() -> Iterator[None]:
     """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""
-    from pointsplat_ns.looking.sampling import sample_views
     from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 
     known = {}
@@ -322,13 +293,7 @@ class FewViews(ViewSource):
 
 
 def in_pictures(views: Views, points: torch.Tensor, min_depth: float = 0.0) -> torch.Tensor:
-    """Which points are in the pictures of views, (C, N) bool.
-
-    Args:
-        views: C cameras.
-        points: (N, 3) float64, in the unit of the views.
-        min_depth: depth that points must exceed.
-    """
+    """Which points (N, 3) beyond a depth are in the pictures of C views, (C, N) bool."""
     at = views.viewmats[:, :3, :3].to(points) @ points.T + views.viewmats[:, :3, 3:].to(points)
     x, y, depth = (views.Ks.to(points) @ at).unbind(1)  # x and y in pixels, times the depth: nothing is divided by it
     within = (x > 0) & (x < views.width * depth) & (y > 0) & (y < views.height * depth)

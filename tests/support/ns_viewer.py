@@ -2,7 +2,7 @@
 
 import io
 import urllib.request
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,19 +16,16 @@ from websockets.sync.client import connect
 
 SECONDS = 120
 """How long it waits for what shall come; a picture takes a fraction of a second."""
-FIELD_OF_VIEW = 1.2
-"""Vertical, in radians."""
+FIELD_OF_VIEW, ASPECT = 1.2, 4 / 3
+"""Vertical, in radians, and width by height."""
 
 
-@dataclass
-class Look:
-    """What a client of the viewer got."""
+class Look(NamedTuple):
+    """What a client of the viewer got, and what the model draws from the same camera, (H, W, 3) in [0, 1]."""
 
     page: bytes
     picture: np.ndarray
-    """(H, W, 3) in [0, 1]."""
     expected: np.ndarray
-    """What the model draws from the same camera, as above."""
 
     def check(self) -> None:
         """Fail unless the page is one, and the picture what the model draws; for a viewer that sends PNG."""
@@ -38,14 +35,14 @@ class Look:
         assert np.abs(self.picture - self.expected).max() <= 1 / 255 + 1e-6
 
 
-def look(viewer: Viewer, pose: np.ndarray, aspect: float = 4 / 3) -> Look:
+def look(viewer: Viewer, pose: np.ndarray) -> Look:
     """Open the viewer's page, connect as it does, and wait for the first picture."""
     place = f"127.0.0.1:{viewer.viser_server.get_port()}"
     with urllib.request.urlopen(f"http://{place}/", timeout=SECONDS) as response:
         page = response.read()
     turn = vtf.SO3.from_matrix(pose[:3, :3]) @ vtf.SO3.from_x_radians(np.pi)
     camera = {"wxyz": turn.wxyz.tolist(), "position": (pose[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO).tolist()}
-    camera |= {"fov": FIELD_OF_VIEW, "aspect": aspect, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
+    camera |= {"fov": FIELD_OF_VIEW, "aspect": ASPECT, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
     with connect(f"ws://{place}", max_size=None, open_timeout=SECONDS) as socket:
         socket.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **camera}))
         picture = None
@@ -54,7 +51,7 @@ def look(viewer: Viewer, pose: np.ndarray, aspect: float = 4 / 3) -> Look:
                 if message["type"] == "BackgroundImageMessage":
                     picture = np.asarray(Image.open(io.BytesIO(message["rgb_bytes"]))) / 255
     height, width = picture.shape[:2]
-    state = CameraState(FIELD_OF_VIEW, aspect, torch.from_numpy(pose[:3]), CameraType.PERSPECTIVE)
+    state = CameraState(FIELD_OF_VIEW, ASPECT, torch.from_numpy(pose[:3]), CameraType.PERSPECTIVE)
     model = viewer.get_model()
     with viewer.train_lock:
         training = model.training

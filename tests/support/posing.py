@@ -1,11 +1,13 @@
 """Files of cameras as others write them, of views that tests have."""
 
 import json
-import struct
 from pathlib import Path
 
+import numpy as np
+from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import invert_rigid, quaternions_of, viewmats_to_opengl
+from pointsplat_ns.geometry.transforms import invert_rigid, viewmats_to_opengl
 from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
@@ -41,45 +43,35 @@ def nerfstudio(views: Views) -> dict:
     }  # fmt: skip
 
 
-def colmap_rows(views: Views) -> list[tuple[int, list[float], list[float], int, str]]:
-    """Image number, quaternion wxyz, translation, camera number and name of each image."""
-    quats = quaternions_of(views.viewmats[:, :3, :3]).tolist()
-    moves = views.viewmats[:, :3, 3].double().tolist()
-    rows = zip(quats, moves, strict=True)
-    return [(10 + index, quat, move, 3, name_of(index)) for index, (quat, move) in enumerate(rows)]
+def write_colmap(folder: Path, suffix: str, lens: tuple, poses: dict, seeds=(), colors=()) -> Path:
+    """A model as COLMAP writes it, ``.txt`` or ``.bin``; each image has as many points as its index.
+
+    ``lens`` is model, width, height and parameters, ``poses`` are world-to-camera matrices (4, 4) by names of images.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    images = {}
+    for index, (name, viewmat) in enumerate(poses.items()):
+        pose = colmap.rotmat2qvec(viewmat[:3, :3]), viewmat[:3, 3]
+        images[10 + index] = colmap.Image(10 + index, *pose, 3, name, np.full((index, 2), 1.5), np.full(index, -1))
+    seen = np.array([10, 11]), np.array([0, 1])  # images, and places among their points
+    points = {i: colmap.Point3D(i, *each, 0.5, *seen) for i, each in enumerate(zip(seeds, colors, strict=True))}
+    colmap.write_model({3: colmap.Camera(3, *lens)}, images, points, str(folder), suffix)
+    return folder
+
+
+def _write_views(views: Views, folder: Path, suffix: str, model: str, extra: tuple[float, ...]) -> Path:
+    K = views.Ks[0].tolist()
+    lens = model, views.width, views.height, [K[0][0], K[1][1], K[0][2], K[1][2], *extra]
+    viewmats = views.viewmats.double().numpy()
+    return write_colmap(folder, suffix, lens, {name_of(index): viewmat for index, viewmat in enumerate(viewmats)})
 
 
 def write_colmap_text(views: Views, folder: Path, model: str = "PINHOLE", extra: tuple[float, ...] = ()) -> Path:
-    """A model in text. Of every other image the line of points is empty."""
-    folder.mkdir(parents=True, exist_ok=True)
-    K = views.Ks[0].tolist()
-    params = [K[0][0], K[1][1], K[0][2], K[1][2], *extra]
-    lens = " ".join(map(str, [3, model, views.width, views.height, *params]))
-    (folder / "cameras.txt").write_text(f"# Camera list with one line of data per camera:\n{lens}\n")
-    lines = ["# Image list with two lines of data per image:"]
-    for number, quat, move, camera, name in colmap_rows(views):
-        lines += [" ".join(map(str, [number, *quat, *move, camera, name])), "" if number % 2 else "1.5 2.5 -1 3 4 77"]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    return folder
-
-
-def colmap_binary(views: Views, model: int = 1, extra: tuple[float, ...] = ()) -> tuple[bytes, bytes]:
-    """``cameras.bin`` and ``images.bin``; each image has as many points as its index."""
-    K = views.Ks[0].tolist()
-    params = [K[0][0], K[1][1], K[0][2], K[1][2], *extra]
-    lenses = struct.pack("<QIiQQ", 1, 3, model, views.width, views.height) + struct.pack(f"<{len(params)}d", *params)
-    images = struct.pack("<Q", len(views))
-    for index, (number, quat, move, camera, name) in enumerate(colmap_rows(views)):
-        images += struct.pack("<I7dI", number, *quat, *move, camera) + name.encode() + b"\0"
-        images += struct.pack("<Q", index) + struct.pack("<ddq", 1.0, 2.0, -1) * index
-    return lenses, images
+    return _write_views(views, folder, ".txt", model, extra)
 
 
 def write_colmap_binary(views: Views, folder: Path, model: int = 1, extra: tuple[float, ...] = ()) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, data in zip(("cameras.bin", "images.bin"), colmap_binary(views, model, extra), strict=True):
-        (folder / name).write_bytes(data)
-    return folder
+    return _write_views(views, folder, ".bin", colmap.CAMERA_MODEL_IDS[model].model_name, extra)
 
 
 def write_photos(scene: Gaussians, views: Views, folder: Path) -> Path:

@@ -7,10 +7,10 @@ the CPU fail as they do on a GPU. All operations on it are listed with their thr
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
 
@@ -23,26 +23,19 @@ GPU = torch.device("meta")
 called."""
 
 
-@dataclass
 class Recorded:
-    """Operations on the device since it is there."""
+    """Names of operations on the device since it is there, each with the thread that called it."""
 
-    here: int = field(default_factory=threading.get_ident)
-    """The thread that :func:`pretend_gpu` was opened in."""
-    operations: list[tuple[str, int]] = field(default_factory=list)
-    """Name of each, and the thread that called it."""
-
-    def names(self) -> set[str]:
-        """Names of all operations."""
-        return {name for name, _ in self.operations}
+    def __init__(self) -> None:
+        self.here = threading.get_ident()
+        self.operations: list[tuple[str, int]] = []
 
     def from_other_threads(self) -> set[str]:
-        """Names of those that other threads called."""
         return {name for name, thread in self.operations if thread != self.here}
 
     def linear_algebra(self) -> set[str]:
-        """Names of those that need the library of linear algebra that torch loads when one is first called."""
-        return {name for name in self.names() if "linalg" in name and "cross" not in name and "norm" not in name}
+        """Those that need the library of linear algebra that torch loads when one is first called."""
+        return {name for name, _ in self.operations if "linalg" in name and not re.search("cross|norm", name)}
 
 
 recorded: Recorded | None = None
@@ -68,13 +61,11 @@ class _There(torch.Tensor):
 
     __torch_function__ = torch._C._disabled_torch_function_impl
 
-    def tolist(self) -> Any:
-        """Its numbers, which torch does not give for classes of others."""
+    def tolist(self) -> Any:  # which torch does not give for classes of others
         return self.detach().cpu().tolist()
 
 
 def _computed(function: Any, args: tuple, kwargs: dict) -> Any:
-    """What an operation gives."""
     given = [value for value in tree_leaves((args, kwargs)) if isinstance(value, torch.Tensor)]
     there = any(isinstance(value, _There) for value in given)
     device = kwargs.get("device")
@@ -97,9 +88,7 @@ def _computed(function: Any, args: tuple, kwargs: dict) -> Any:
     return tree_map(lambda value: _There(value) if to and isinstance(value, torch.Tensor) else value, result)
 
 
-class _Here(TorchDispatchMode):
-    """Catches operations that make tensors of the device from nothing, or from those of the CPU."""
-
+class _Here(TorchDispatchMode):  # catches what makes tensors of the device from nothing, or from those of the CPU
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         return _computed(function, args, kwargs or {})
 
@@ -119,9 +108,7 @@ def _new_tensor(like: torch.Tensor, data: Any, **options: Any) -> torch.Tensor:
     return torch.tensor(data, **{"dtype": like.dtype, "device": like.device, **options})
 
 
-class _Autocast(torch.autocast):
-    """torch knows no precision of its own "meta"."""
-
+class _Autocast(torch.autocast):  # torch knows no precision of its own "meta"
     def __init__(self, device_type: str, *arguments: Any, **options: Any):
         super().__init__("cpu" if device_type == GPU.type else device_type, *arguments, **options)
 

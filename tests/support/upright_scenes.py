@@ -1,5 +1,7 @@
 """Scenes of flat Gaussians that stand upright, and turns of the world."""
 
+import math
+
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -14,8 +16,7 @@ def plates(*faces: tuple[tuple[float, float, float], tuple[float, float, float]]
     generator = torch.Generator().manual_seed(0)
     means, scales = [], []
     for middle, half in faces:
-        sides = [2 * side for side in half if side]
-        count = max(8, int(density * sides[0] * sides[1]))
+        count = max(8, int(density * math.prod(2 * side for side in half if side)))
         share = 2 * torch.rand(count, 3, generator=generator) - 1
         means.append(torch.tensor(middle) + share * torch.tensor(half))
         scales.append(torch.tensor([0.1 if side else 0.005 for side in half]).log().expand(count, 3))

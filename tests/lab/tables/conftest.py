@@ -1,30 +1,20 @@
 """A small room whose tables are measured within seconds."""
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-import peers
 import pointsplat_ns as ps
 from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
-from lab.tables.ways import Ways
 from making import box_room
 from pointsplat_ns.compression import repair
 from pointsplat_ns.looking import view_source
-from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
-
-
-@pytest.fixture()
-def peer(tmp_path) -> Callable[..., str]:
-    """A function that writes a program that stands for splat-transform, and gives its path."""
-    return functools.partial(peers.peer, tmp_path, "3.7.0")
 
 
 @pytest.fixture(scope="session")
@@ -45,16 +35,15 @@ def weights(tmp_path_factory) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def room_views() -> ps.Views:
-    """Three small views of the room."""
-    return sample_views(box_room(0, 400), 3, 48, 36)
+def views_of_room() -> ps.Views:
+    return ps.sample_views(box_room(0, 400), 3, 48, 36)
 
 
 @pytest.fixture()
-def room(tmp_path, room_views, no_lpips, monkeypatch) -> Path:
+def room(tmp_path, views_of_room, no_lpips, monkeypatch) -> Path:
     """A closed box of 400 Gaussians as a file, looked at from three views; repairs take two steps, figures are
     none."""
-    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: room_views[:count])
+    monkeypatch.setattr(view_source.Sampler, "views", lambda sampler, count, *_, **options: views_of_room[:count])
     monkeypatch.setattr(layout, "plot_figure", lambda cells, groups, path: path.write_text("a figure"))
     monkeypatch.setitem(repair.STEPS, "quick", 2)
     ps.save(box_room(0, 400), tmp_path / "room.ply")
@@ -70,11 +59,3 @@ def measured(room, tmp_path) -> Callable[..., Tables]:
         return measure_tables(scenes or (room,), folder, **{**usual, **options})
 
     return measure
-
-
-@pytest.fixture()
-def few_ways(monkeypatch) -> None:
-    """Tables that have no more than the dense scene, the paper's selection at its lambda, and LightGaussian."""
-    few = ("dense", "paper", "lightgaussian", "lightgaussian-tuned")
-    every = Ways.cells
-    monkeypatch.setattr(Ways, "cells", lambda ways, shares: [c for c in every(ways, shares) if c[0].name in few])

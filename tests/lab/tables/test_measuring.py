@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 import pointsplat_ns as ps
+from lab.common.ways import SplatTransform
 from lab.tables.cells import Tables
 from lab.tables.measure import Judge
-from lab.tables.ways import WAYS
+from lab.tables.ways import WAYS, Ways
 from making import box_room
+from peers import peer
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.errors import PointSplatError, SceneError
 
@@ -35,8 +37,8 @@ def all_weights(weights):
     ]
 
 
-def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, peer, tmp_path):
-    tables = measured(refiners=all_weights, splat_transform=peer())
+def test_every_cell_can_be_measured_and_says_by_what(measured, all_weights, tmp_path):
+    tables = measured(refiners=all_weights, splat_transform=peer(tmp_path, "3.7.0"))
     cells = cells_of(tables)
     assert {*cells} == {(way.name, share) for way, share in WAYS.cells((0.3,))} and tables.missing == {}
     for (way, share), cell in cells.items():
@@ -86,24 +88,29 @@ def test_what_cannot_be_measured_is_not_and_says_why(measured, tmp_path, weights
     assert rows and all("| not measured | - |" in line for line in rows)
 
 
-@pytest.mark.parametrize("trained", [{"keep": 0.1}, {"keep": 20_000}, {"keep": 0.1, "more_keeps": [0.2]}])
-def test_weights_of_another_budget_fill_no_row(measured, weights, trained):
-    other = weights("budget", {"by": "paper", **trained})
+TRAIN = (
+    "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual --pipeline.model.by paper "
+    "--pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
+)
+
+
+@pytest.mark.parametrize(
+    ("trained", "why"),
+    [
+        ({"keep": 20_000}, TRAIN),
+        ({"keep": 0.1, "more_keeps": [0.2]}, TRAIN),
+        ({"keep": 0.3, "scenes": ["hall", "room"]}, "were trained on this scene"),
+    ],
+)
+def test_weights_of_another_budget_or_that_know_the_scene_fill_no_row(measured, weights, trained, why):
+    other = weights("other", {"by": "paper", **trained})
     tables = measured(refiners=[other], only=["room/pointsplat/30%", "room/paper/30%"])
-    assert [*cells_of(tables)] == [("paper", 0.3)]
-    assert tables.missing["room/pointsplat/30%"].endswith(
-        "to train them: ns-train pointsplat --data SCENES --pipeline.model.encoder dual --pipeline.model.by paper "
-        "--pipeline.model.keep 0.3 --pipeline.model.opacity-weight 0.3"
-    )
+    assert [*cells_of(tables)] == [("paper", 0.3)] and why in tables.missing["room/pointsplat/30%"]
 
 
-def test_weights_that_know_the_scene_do_not_test_it(measured, weights):
-    knows = weights("knows", {"by": "paper", "keep": 0.3, "scenes": ["hall", "room"]})
-    tables = measured(refiners=[knows], only=["room/pointsplat/*", "room/paper/*"])
-    assert "were trained on this scene" in tables.missing["room/pointsplat/30%"]
-
-
-def test_an_interrupted_run_goes_on_and_loses_nothing(measured, few_ways, tmp_path, monkeypatch):
+def test_an_interrupted_run_goes_on_and_loses_nothing(measured, tmp_path, monkeypatch):
+    few, every = ("dense", "paper", "lightgaussian"), Ways.cells
+    monkeypatch.setattr(Ways, "cells", lambda *given: [cell for cell in every(*given) if cell[0].name in few])
     figures, asked = Judge.figures, []
 
     def interrupted(self, scene):
@@ -151,9 +158,7 @@ def test_options_that_mean_nothing_are_refused(measured, options, said):
         measured(**options)
 
 
-@pytest.mark.parametrize(
-    "content", ["", "{", "[]", "null", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}']
-)
+@pytest.mark.parametrize("content", ["", "[]", "[" * 100_000, '{"format": "pointsplat-tables"}', '{"format": 3}'])
 def test_damaged_cells_are_refused_in_one_line(measured, tmp_path, content):
     (tmp_path / "tables").mkdir()
     (tmp_path / "tables" / "tables.json").write_text(content)
@@ -171,3 +176,27 @@ def test_files_of_others_are_not_overwritten(measured, tmp_path):
     with pytest.raises(SceneError, match="is a file"):
         measured(folder=tmp_path / "file")
     assert (tmp_path / "tables" / "tables.md").read_text() == "mine"
+
+
+def test_each_mode_makes_a_smaller_scene(tmp_path):
+    found = SplatTransform(peer(tmp_path, "3.7.0"))
+    assert (found.version, found.missing) == ("3.7.0", "")
+    ps.save(box_room(0, 60), tmp_path / "room.ply")
+    before = sorted(tmp_path.iterdir())
+    small = [mode.reduce(tmp_path / "room.ply", 20) for mode in found.modes]
+    assert [len(scene) for scene, _ in small] == [20, 20] and small[0][1].seconds > 0
+    assert not (small[0][0].means == small[1][0].means).all()
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "says, version, modes",
+    [
+        ("splat-transform v2.7.1", "2.7.1", 1),
+        ("v10.0.0-beta.1", "10.0.0-beta.1", 2),
+        ("warning: old\nv3.0.0", "3.0.0", 2),
+    ],
+)
+def test_versions_are_told_apart(says, version, modes, tmp_path):
+    found = SplatTransform(peer(tmp_path, "3.7.0", says))
+    assert found.version == version and len(found.modes) == modes

@@ -201,7 +201,7 @@ def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
     assert "\n" not in str(caught.value) and (config.get_checkpoint_dir() / "step-000000007.ckpt").is_file()
 
 
-def test_a_training_takes_tiny_numbers_as_zero_also_in_threads_and_only_while_it_runs(started, monkeypatch):
+def test_a_training_and_its_threads_alone_take_tiny_numbers_as_zero(started, monkeypatch):
     found, losses_of = [], SplatfactoCpuModel.get_loss_dict
 
     def losses(self, *args, **kwargs):
