@@ -1,17 +1,16 @@
 """The frame of a scene that no run of nerfstudio tells of: found by small renders beside photos.
 
 Files of cameras have the frame of the data. A scene may have another: nerfstudio and gsplat turn, centre and scale the
-data before they train; programs have different ideas of up, and of the axes of cameras; editors scale scenes.
+data before they train; programs have different ideas of up, and of the axes of cameras.
 
 Thresholds are chosen on the photos of nine captures. Photos and renders correlate by 0.83 to 0.92 in the right frame,
-by at most 0.32 where the world or the cameras are turned by axes, by 0.4 to 0.8 at four fifths of the scale.
+by at most 0.32 where the world or the cameras are turned by axes.
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,15 +25,9 @@ from pointsplat_ns.io.camera_files.cameras import Motion
 from pointsplat_ns.io.camera_files.colmap import colmap_points
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.photos.pose_check import POSE_CHECK, Likeness, Photo, likeness
+from pointsplat_ns.photos.pose_check import MIN_LIKENESS, POSE_CHECK, Likeness, Photo, likeness
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
-
-LEAST_LIKENESS = 0.5
-"""Least mean correlation of renders and their photos."""
-
-SAME_SCALE = 0.02
-"""Deviation of a scale from 1 that is left as it is."""
 
 Frame = tuple[str, Tensor]
 """What leads to a frame, and poses (C, 4, 4) from camera to world in it."""
@@ -77,7 +70,7 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
     if words:
         logger.info(
             "poses are moved into the frame of the scene: %s (%.1f -> %.1f dB PSNR in %d small photos)",
-            ", ".join(words), given.psnr, found.psnr, found.count,
+            words, given.psnr, found.psnr, found.count,
         )  # fmt: skip
     return search.views_of(poses)
 
@@ -85,7 +78,7 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
 def _fits(found: Likeness) -> bool:
     """Whether renders are like their photos, and more than like the photos of other views, which show the same object
     or sky: by three tenths of what is possible. Right frames have eight tenths and more."""
-    return found.own >= max(LEAST_LIKENESS, found.others + 0.3 * (1 - found.others))
+    return found.own >= max(MIN_LIKENESS, found.others + 0.3 * (1 - found.others))
 
 
 class _Search:
@@ -115,7 +108,7 @@ class _Search:
             shown.append((replace(own, K=view.K, width=view.width, height=view.height), image, mask))
         return likeness(self._drawn, shown)
 
-    def best(self, given: Likeness) -> tuple[Likeness, list[str], Tensor]:
+    def best(self, given: Likeness) -> tuple[Likeness, str, Tensor]:
         """The greatest likeness, what leads to its frame, and poses in it; ``given`` is that of the given frame."""
         found, words, poses = given, "", self.poses
         others = [self._known]
@@ -125,39 +118,11 @@ class _Search:
             text, best = max(frames, key=lambda frame: self.fit(frame[1], few=frames is not self._known).own)
             if (other := self.fit(best)).own > found.own + 0.02:
                 found, words, poses = other, text, best
-        start = poses
-        scale = _best_scale(lambda factor: self.fit(_scaled(start, factor)).own)
-        named = [words] if words else []
-        if abs(scale - 1) <= SAME_SCALE:
-            return found, named, poses
-        scaled = _scaled(poses, scale)
-        return self.fit(scaled), [*named, f"positions times {scale:.4g}"], scaled
+        return found, words, poses
 
 
 def _scaled(poses: Tensor, factor: float) -> Tensor:
     return Motion(torch.eye(4, **DOUBLES)[:3], factor).of(poses)
-
-
-def _best_scale(likeness_at: Callable[[float], float]) -> float:
-    """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or, where that is
-    unlike, from the best of a hundredth to a hundred."""
-    scale = 1.0
-    if likeness_at(scale) < LEAST_LIKENESS:
-        scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
-    for step in (1.1, 1.01, 1.002):
-        at = functools.cache(lambda power, start=scale, step=step: likeness_at(start * step**power))
-        power = 0
-        while abs(power) < 48:
-            best = max((power, power - 1, power + 1), key=at)
-            if best == power:
-                break
-            power = best
-        low, middle, high = at(power - 1), at(power), at(power + 1)
-        bend = low - 2 * middle + high
-        scale *= step ** (power + (0.5 * (low - high) / bend if bend < 0 else 0.0))
-        if abs(scale - 1) <= SAME_SCALE:
-            break
-    return scale
 
 
 _GSPLAT = "normalised as gsplat does"

@@ -111,7 +111,7 @@ class PosesFile:
                 scene without a visible Gaussian is not refused here.
         """
         photos = self._photos()
-        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text()
+        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text
         if not wrong:
             return bool(photos)
         mend = (
@@ -141,7 +141,7 @@ def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) ->
     """Raise a DataError if renders of a scene are not like the photos of its training, a few of which are read;
     ``data`` is the path of these."""
     some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
-    if wrong := likeness(scene, some).text():
+    if wrong := likeness(scene, some).text:
         raise DataError(
             f"{data}: {wrong}; the photos or their poses are probably not those of the training: put back the data as "
             "it was, or name the folder where it is now (--data DIR)"
