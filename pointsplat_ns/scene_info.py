@@ -1,9 +1,8 @@
-"""Figures of a scene: its file, counts, SH, up, fill, opacities, sizes, bounds and suspicious rows."""
+"""Figures of a scene: its file, count, SH, up, fill, bounds and suspicious rows."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ class SceneInfo:
     Example:
         >>> import pointsplat_ns as ps
         >>> found = ps.info(ps.example_room()[:100])
-        >>> sum(found.opacities), found.suspicious
+        >>> found.gaussians, found.suspicious
         (100, {})
     """
 
@@ -57,10 +56,6 @@ class SceneInfo:
     """Number and size of these views, as text."""
     sh_energies: list[float]
     """Mean square of the contribution of each band to the colours, from degree 1 on."""
-    opacities: list[int]
-    """Gaussians by opacity, in ten bins from 0 to 1."""
-    sizes: dict[str, int]
-    """Gaussians by their largest standard deviation, scene units: powers of ten, by their lower bound."""
     bounds: list[list[float]]
     """Lowest and highest corner of all positions."""
     content: list[list[float]]
@@ -104,16 +99,14 @@ def info(
     if not isinstance(scene, Gaussians):
         file = str(scene)
         scene = read_scene(scene, all_rows=True)
-        parts = source_parts(file)
-        kind = kind_of(file)
-        bytes_ = sum(part.stat().st_size for part in parts)
+        kind, bytes_ = kind_of(file), sum(part.stat().st_size for part in source_parts(file))
     scene = scene.detach().to("cpu", torch.float32)
     usable = scene.usable()
     good = scene[usable]
     source = ViewSource(good, resolution=size, up=known)
     try:
         views = source.whole()
-        up_found: Up | None = source.up
+        up_found: Up | None = source.sampler.up
         filled, views_text = fill(good, views), f"{len(views)} views of {views.width} x {views.height} pixels"
     except DataError:  # nothing is visible
         up_found, filled, views_text = known, None, ""
@@ -130,8 +123,6 @@ def info(
         fill=filled,
         views=views_text,
         sh_energies=band_energies(scene),
-        opacities=torch.histc(good.alphas, 10, 0.0, 1.0).long().tolist(),
-        sizes=_by_powers_of_ten(good.scales.amax(dim=1)) if len(good) else {},
         bounds=_corners(good.means, 0.0),
         content=_corners(good.means, 0.02),
         suspicious=_suspicious(scene, usable),
@@ -150,14 +141,6 @@ def _suspicious(scene: Gaussians, usable: Tensor) -> dict[str, int]:
         "zero quaternion": int((good.quats.abs().amax(dim=1) < SHORTEST).sum()) if len(good) else 0,
     }
     return {what: count for what, count in counts.items() if count}
-
-
-def _by_powers_of_ten(log_sizes: Tensor) -> dict[str, int]:
-    powers = (log_sizes.double() / math.log(10)).floor()
-    flat = powers.isinf()
-    values, counts = powers[~flat].unique(return_counts=True)
-    sizes = {f"1e{int(value):+03d}": int(count) for value, count in zip(values, counts, strict=True)}
-    return {"0": int(flat.sum()), **sizes} if bool(flat.any()) else sizes
 
 
 def _corners(means: Tensor, outside: float) -> list[list[float]]:

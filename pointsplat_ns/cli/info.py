@@ -25,7 +25,7 @@ def info(
     force: options.Force = False,
     json_output: options.Json = False,
 ) -> None:
-    """Look at scenes: format and size, counts, SH, up, fill, opacities, sizes, bounds, and rows that look wrong.
+    """Look at scenes: format and size, count, SH, up, fill, bounds, and rows that look wrong.
     Several, and all scenes of a folder, make a table.
 
     Args:
@@ -107,15 +107,4 @@ def _print(found: SceneInfo) -> None:
         if corners:
             low, high = (" ".join(f"{value:.4g}" for value in corner) for corner in corners)
             print(f"bounds, {name}: {low} to {high}, scene units")
-    step = 1 / max(len(found.opacities), 1)
-    _bars("opacity", {f"{index * step:.1f}": count for index, count in enumerate(found.opacities)})
-    _bars("largest standard deviation, scene units, from", found.sizes)
     print("suspicious: " + (", ".join(f"{what} {n:,}" for what, n in found.suspicious.items()) or "nothing"))
-
-
-def _bars(title: str, counts: dict[str, int]) -> None:
-    print(f"{title}:")
-    width = 40  # characters of the longest bar
-    most = max([*counts.values(), 1])
-    for name, count in counts.items():
-        print(f"  {name:>6} {'#' * round(width * count / most):<{width}} {count:,}")

@@ -179,8 +179,8 @@ class Levels:
         """The manifest's facts on all levels together, and on each."""
         dense, file, views = self.dense, self.source, None
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
-        if bool((dense.alphas > 0).any()):
-            boxes["content"] = content_box(dense)
+        if (content := content_box(dense)) is not None:
+            boxes["content"] = content
         if self.reference is not None:
             of = self.reference.views
             views = {"count": len(of), "origin": self.origin, "width": of.width, "height": of.height}

@@ -51,15 +51,15 @@ def views_and_weights(
     Returns:
         No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
     """
-    found, photos_found = (views if isinstance(views, Views) else None), False
+    found, traced = (views if isinstance(views, Views) else None), False
     if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:
         sampler = views or Sampler(participants.scene)
         with contextlib.suppress(DataError):
             found = sampler.views(settings.sampled_views, settings.view_seed)
-            photos_found = sampler.photos is not None
+            traced = sampler.traced
     report(0.6)
     weights = visibility_weights(participants, found, settings, lambda share: report(0.6 + 0.4 * share))
-    return found, weights * trace_factors(participants.scene, participants.members) if photos_found else weights
+    return found, weights * trace_factors(participants.scene, participants.members) if traced else weights
 
 
 def visibility_weights(
