@@ -8,11 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pointsplat_ns.api import load
 from pointsplat_ns.compacting import Looking, Source, read_source
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
+from pointsplat_ns.looking.upright import up_named
+from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pages.camera_path import FPS, PHOTO_SIDE, FilmSettings, camera_path
 from pointsplat_ns.pages.film import SplitScreen, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
@@ -85,13 +89,15 @@ def render_path(
     if split not in ("side-by-side", "wipe"):
         raise PointSplatError(f"split is {split!r}; expected side-by-side or wipe")
     settings = FilmSettings(width, height, fps, seconds)
-    looking = Looking(views, None if isinstance(views, Views) else (PHOTO_SIDE, PHOTO_SIDE), up, data)
+    looking = Looking(views, up=up, data=data)
     kind = check_output(output, force)
     dense, source = read_source(scene, looking)
+    if source.given is not None and not isinstance(views, Views):  # from a file, as large as its photos
+        source = ViewSource(dense, source.given.resized(PHOTO_SIDE))
     sources, loaded = [scene], [dense]
     if other is not None:
         sources.append(other)
-        loaded.append(read_source(other, Looking("none"))[0].at_offset(dense.offset))
+        loaded.append(_loaded(other).at_offset(dense.offset))
     if source.given is not None and kind == "frames" and seconds is None and path is None:
         settings = replace(settings, seconds=len(source.given) / (fps or FPS))
     chosen = camera_path(dense, source, path, settings, kind == "picture", looking.upward)
@@ -142,19 +148,26 @@ def open_viewer(
     from pointsplat_ns.pages.kept import ViewedScene
     from pointsplat_ns.pages.viewer import Viewer
 
-    looking = Looking(views, None, up, data)
+    upward = up_named(up)
 
     def read(path: Path, name: str) -> ViewedScene:
         return ViewedScene(name, None, *read_source(path, Looking("none")))
 
     scenes: list[ViewedScene] = []
     for index, shown in enumerate(one for one in (scene, other) if one is not None):
-        loaded, source = read_source(shown, Looking() if scenes else looking)
-        loaded = loaded.at_offset(scenes[0].scene.offset) if scenes else loaded
         path = None if isinstance(shown, Gaussians) else Path(shown)
+        if scenes:
+            loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
+            source = view_source(loaded, run=path)
+        else:
+            loaded, source = read_source(shown, Looking(views, data=data))  # upward is the page's, not merging's
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
         scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels))
-    return Viewer(scenes, host, port, looking.upward, None if scenes else read)
+    return Viewer(scenes, host, port, upward, None if scenes else read)
+
+
+def _loaded(scene: Source) -> Gaussians:
+    return scene if isinstance(scene, Gaussians) else load(scene)
 
 
 def _name(scene: Source, index: int) -> str:
