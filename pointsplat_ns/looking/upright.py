@@ -117,8 +117,8 @@ def upright_axis(surface: Surface, traced: bool = False) -> Tensor:
     """The axis (3,) along which a scene stands, float64, of length 1 and of either sign.
 
     It is an axis of the world if that fits about as well as the best direction, and y if that fits about as well as the
-    best of the three. A capture, of which ``traced`` says that it shows where photos were taken, may have any frame: all
-    axes of the world have a tenth more there, by which two of six stand along one.
+    best of the three. A capture, of which ``traced`` says that it shows where photos were taken, may have any frame:
+    all axes of the world have a tenth more there, by which two of six stand along one.
     """
     near = surface.points.norm(dim=1) < CONTENT_RADIUS
     near = (near if bool(near.any()) else ~near).nonzero()[:4096, 0]

@@ -16,17 +16,6 @@ from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.photos.pose_check import POSE_CHECK, Photo, likeness, pose_faults
 from pointsplat_ns.views import Views, spread_indices
 
-
-def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
-    """Read a scene and its views. The file of cameras is read first; then both are checked against each other. Errors
-    are those of :meth:`PosesFile.of`, :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
-    found = PosesFile.of(scene, poses)
-    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
-    found = found.relative_to(dense.offset)
-    found.check(dense)
-    return dense, found.views
-
-
 NO_POSES = "none"
 """In place of a file of cameras: views are sampled, whatever lies beside the scene."""
 
@@ -57,10 +46,15 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
 
 
 def read_found(scene: Gaussians | Path | str, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
-    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. Errors are
-    those of :func:`read_posed`."""
+    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. A given one
+    is read before the scene; then both are checked against each other. Errors are those of :meth:`PosesFile.of`,
+    :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
     if poses is not None and not without_poses(poses):
-        return *read_posed(scene, poses), Path(poses)
+        given = PosesFile.of(scene, poses)
+        dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
+        given = given.relative_to(dense.offset)
+        given.check(dense)
+        return dense, given.views, given.path
     if isinstance(scene, Gaussians):
         return scene, None, None
     path = Path(scene)
