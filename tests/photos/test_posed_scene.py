@@ -59,7 +59,7 @@ def test_the_transforms_beside_scene_or_poses_are_applied(beside, scene, views, 
     dense, found, _ = read_found(tmp_path / "scene" / "room.ply", path)
     assert len(dense) == len(scene)
     torch.testing.assert_close(found.viewmats.float(), views.viewmats.float(), rtol=0, atol=1e-3)  # of 1000 units
-    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply")
+    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply", overwrite=True)
     with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
         read_found(tmp_path / "scene" / "room.ply", path)
 
