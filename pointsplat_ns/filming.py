@@ -8,17 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pointsplat_ns.api import Source, load
+from pointsplat_ns.api import load
+from pointsplat_ns.compacting import Looking, Source, read_source
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.sog_stream import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data, view_source
+from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
-from pointsplat_ns.photos.posed_scene import read_found, without_poses
 from pointsplat_ns.system.progress import Progress, tracked
 from pointsplat_ns.views import Views
 
@@ -83,18 +83,18 @@ def render_path(
         5
     """
     settings = FilmSettings(width, height, fps, seconds)
-    upward = up_named(up)
+    looking = Looking(views, up=up, data=data)
     kind = check_output(output, force)
-    need_named_data(scene, data)
-    sources = [scene] if other is None else [scene, other]
-    first, given = _with_views(scene, views)
-    if given is not None and not isinstance(views, Views):  # from a file, as large as its photos
-        given = given.resized(PHOTO_SIDE)
-    loaded = [first if source is scene else _loaded(source).at_offset(first.offset) for source in sources]
-    if given is not None and kind == "frames" and seconds is None:
-        settings = replace(settings, seconds=max(1, len(given)) / fps)
-    view_source = _source(None if without_poses(views) else scene, first, given, data)
-    cameras, origin = camera_path(loaded[0], view_source, settings, kind == "picture", upward)
+    dense, source = read_source(scene, looking)
+    if source.given is not None and not isinstance(views, Views):  # from a file, as large as its photos
+        source = ViewSource(dense, source.given.resized(PHOTO_SIDE))
+    sources, loaded = [scene], [dense]
+    if other is not None:
+        sources.append(other)
+        loaded.append(_loaded(other).at_offset(dense.offset))
+    if source.given is not None and kind == "frames" and seconds is None:
+        settings = replace(settings, seconds=len(source.given) / fps)
+    cameras, origin = camera_path(dense, source, settings, kind == "picture", looking.upward)
     names = [f"{_name(s, i)}, {len(g):,} Gaussians" for i, (s, g) in enumerate(zip(sources, loaded, strict=True))]
     logger.info("%d x %d pixels: %s", cameras.width, cameras.height, origin)
     frames = render_frames(loaded, cameras, names if len(loaded) > 1 else ())
@@ -143,38 +143,25 @@ def open_viewer(
     from pointsplat_ns.pages.viewer import Viewer
 
     upward = up_named(up)
-    need_named_data(scene, data)
 
     def read(path: Path, name: str) -> ViewedScene:
-        loaded = load(path)
-        return ViewedScene(name, None, loaded, _source(loaded, loaded, None))
+        return ViewedScene(name, None, *read_source(path, Looking("none")))
 
     scenes: list[ViewedScene] = []
-    for index, source in enumerate(source for source in (scene, other) if source is not None):
-        loaded, given = (_loaded(source), None) if scenes else _with_views(source, views)
-        loaded = loaded.at_offset(scenes[0].scene.offset) if scenes else loaded
-        run = None if index == 0 and without_poses(views) else source
-        path = None if isinstance(source, Gaussians) else Path(source)
+    for index, shown in enumerate(one for one in (scene, other) if one is not None):
+        path = None if isinstance(shown, Gaussians) else Path(shown)
+        if scenes:
+            loaded = _loaded(shown).at_offset(scenes[0].scene.offset)
+            source = view_source(loaded, run=path)
+        else:
+            loaded, source = read_source(shown, Looking(views, data=data))  # upward is the page's, not merging's
         levels = [] if path is None or (path / RUN_FILES.config).is_file() else coarser_levels(path, len(loaded))
-        views_of = _source(run, loaded, given, None if index else data)
-        scenes.append(ViewedScene(_name(source, index), path, loaded, views_of, levels))
+        scenes.append(ViewedScene(_name(shown, index), path, loaded, source, levels))
     return Viewer(scenes, host, port, upward, None if scenes else read)
 
 
 def _loaded(scene: Source) -> Gaussians:
     return scene if isinstance(scene, Gaussians) else load(scene)
-
-
-def _with_views(scene: Source, views: Views | str | Path | None) -> tuple[Gaussians, Views | None]:
-    """A scene, and its views if they are given, or a file of cameras is given or lies nearby."""
-    if isinstance(views, Views):
-        return _loaded(scene), views
-    loaded, found, _ = read_found(scene, views)
-    return loaded, found
-
-
-def _source(scene: Source | None, loaded: Gaussians, given: Views | None, data: str | Path | None = None) -> ViewSource:
-    return view_source(loaded, given, None if isinstance(scene, Gaussians) else scene, data)
 
 
 def _name(scene: Source, index: int) -> str:

@@ -151,13 +151,10 @@ class Gaussians:
             raise SceneError(f"offset is {self.offset!r}; expected three finite numbers")
 
     @classmethod
-    def empty(
-        cls, sh_degree: int = 0, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-    ) -> Gaussians:
-        """A scene without Gaussians."""
-        rest = (sh_degree + 1) ** 2 - 1
-        shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, rest, 3))
-        return cls(*(torch.empty(shape, dtype=dtype, device=device) for shape in shapes))
+    def empty(cls, sh_degree: int = 0) -> Gaussians:
+        """A scene without Gaussians, float32 on the CPU."""
+        shapes = ((0, 3), (0, 3), (0, 4), (0, 1), (0, 3), (0, (sh_degree + 1) ** 2 - 1, 3))
+        return cls(*(torch.empty(shape, dtype=torch.float32, device="cpu") for shape in shapes))
 
     @classmethod
     def cat(cls, scenes: Sequence[Gaussians]) -> Gaussians:
@@ -260,8 +257,8 @@ class Gaussians:
         0) and log-scales of -Inf (a flat axis), and no standard deviation is infinite in the scene's dtype: log-scales
         are at most 88.7 in float32 and bfloat16, 709 in float64 and 11 in float16."""
         ok = torch.ones(len(self), dtype=torch.bool, device=self.device)
-        for name, value in self.items():
-            flat = value.reshape(len(self), -1) if len(self) else value.reshape(0, 1)
+        for name, value in self.items() if len(self) else ():
+            flat = value.reshape(len(self), -1)
             if name == "opacities":
                 bad = flat.isnan()
             elif name == "scales":

@@ -7,15 +7,14 @@ import re
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import axis_along, smallest_turn
+from pointsplat_ns.geometry.transforms import axis_along, direction_of, smallest_turn
 from pointsplat_ns.io.runs import RUN_FILES, Run, may_be_run, open_run
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.upright import axis_named
+from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS
 
 
@@ -55,13 +54,14 @@ def place(
     """
     if not 0 < scale < math.inf:
         raise PointSplatError(f"scale is {scale:g}; expected a number above 0")
-    directions = None if up is None else _directions(up)
+    match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", "" if up is None else up.strip().lower())
+    if up is not None and match is None:
+        raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
     if original_frame is not None:
         scene = _frame_at(original_frame).inverse().apply(scene)
-    if directions is not None:
-        now, wanted = directions
-        matrix = smallest_turn(Sampler(scene).up.direction if now is None else now, wanted)
-        turned = Similarity(matrix, 1.0, torch.zeros(3, **DOUBLES)).apply(scene)
+    if match is not None:
+        now, wanted = up_named(match[1]) or Sampler(scene).up, direction_of(match[2])
+        turned = Similarity(smallest_turn(now.direction, wanted), 1.0, torch.zeros(3, **DOUBLES)).apply(scene)
         scene = turned.replace(up=axis_along(wanted))
     if scale != 1.0:
         scene = Similarity(torch.eye(3, **DOUBLES), scale, torch.zeros(3, **DOUBLES)).apply(scene)
@@ -95,11 +95,3 @@ def run_frame(run: Run) -> Similarity:
         )
     u, _, v = torch.linalg.svd(matrix)
     return Similarity(u @ v, size * run.scale, run.transform[:, 3].double() * run.scale)
-
-
-def _directions(up: str) -> tuple[Tensor | None, Tensor]:
-    """The up direction of the scene (None: to be estimated) and the wanted up direction."""
-    match = re.fullmatch(r"(?:([+-]?[xyz]):)?([+-]?[xyz])", up.strip().lower())
-    if not match:
-        raise PointSplatError(f"up is {up!r}; expected an axis such as z or -y, or two such as -y:z (from -y to z)")
-    return (None if match[1] is None else axis_named(match[1])), axis_named(match[2])

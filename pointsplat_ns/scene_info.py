@@ -113,7 +113,7 @@ def info(
     source = ViewSource(good, resolution=size, up=known)
     try:
         views = source.whole()
-        up_found: Up | None = source.up
+        up_found: Up | None = source.sampler.up
         filled, views_text = fill(good, views), f"{len(views)} views of {views.width} x {views.height} pixels"
     except DataError:  # nothing is visible
         up_found, filled, views_text = known, None, ""

@@ -37,23 +37,14 @@ class Closeness:
         return views_text(len(self.errors)) + ("" if self.width is None else f" of {self.width} pixels")
 
     @property
-    def error(self) -> float:
-        """Mean squared error over all pixels of all views."""
-        return sum(self.errors) / len(self.errors)
-
-    @property
     def psnr(self) -> float:
         """PSNR over the pixels that the dense scene covers in all views, dB; inf if nothing differs."""
-        return psnr_of(self.error, sum(self.covered) / len(self.covered))
+        return psnr_of(sum(self.errors) / len(self.errors), sum(self.covered) / len(self.covered))
 
     @property
     def worst(self) -> float:
         """PSNR of the worst view, dB."""
-        return min(map(self.psnr_of_view, range(len(self.errors))))
-
-    def psnr_of_view(self, index: int) -> float:
-        """PSNR of one view, dB."""
-        return psnr_of(self.errors[index], self.covered[index])
+        return min(map(psnr_of, self.errors, self.covered))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,34 +60,18 @@ class Reference:
     alphas: list[Tensor] | None = None
     """C alpha pictures (H, W, 1), for errors over two backgrounds; None for errors over the views' own."""
 
-    def errors(self, scene: Gaussians) -> list[float]:
-        """Mean squared error over all pixels of each view."""
-        return list(self._errors(_drawn(scene, self.views)))
-
     def psnr(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> tuple[float, float]:
-        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`. ``progress`` is called with the share
-        of the views done."""
-        errors: list[float] = []
-        for error in self._errors(_drawn(scene, self.views)):
-            errors.append(error)
-            if progress is not None:
-                progress(len(errors) / len(self.renders))
-        close = Closeness(tuple(errors), self.covered)
+        """PSNR over all views, and of the worst view, dB; see :class:`Closeness`."""
+        close = self.closeness(scene, progress)
         return close.psnr, close.worst
 
     def closeness(self, scene: Gaussians, progress: Callable[[float], None] | None = None) -> Closeness:
         """Errors of a scene; ``progress`` is called with the share of the views done."""
-        return self.closeness_of((image for image, _ in _drawn(scene, self.views)), progress)
+        return self._closeness(_drawn(scene, self.views), progress)
 
-    @torch.no_grad()
-    def closeness_of(self, images: Iterable[Tensor], progress: Callable[[float], None] | None = None) -> Closeness:
-        """Errors of C pictures (H, W, 3)."""
-        errors: list[float] = []
-        for image, target in zip(images, self.renders, strict=True):
-            errors.append(float((image.double() - target.double()).square().mean()))
-            if progress is not None:
-                progress(len(errors) / len(self.renders))
-        return Closeness(tuple(errors), self.covered, self.views.width)
+    def closeness_of(self, images: Iterable[Tensor]) -> Closeness:
+        """Errors of C pictures (H, W, 3) over the views' own background."""
+        return self._closeness(((image, None) for image in images), None)
 
     @torch.no_grad()
     def ssim(self, scene: Gaussians) -> float:
@@ -107,15 +82,22 @@ class Reference:
         return total / len(self.renders)
 
     @torch.no_grad()
-    def _errors(self, pictures: Iterable[tuple[Tensor, Tensor]]) -> Iterator[float]:
-        for index, (image, alpha) in enumerate(pictures):
-            apart = image.double() - self.renders[index].double()
+    def _closeness(
+        self, pictures: Iterable[tuple[Tensor, Tensor | None]], progress: Callable[[float], None] | None
+    ) -> Closeness:
+        """Errors of images, with their alpha where :attr:`alphas` are compared, too."""
+        errors: list[float] = []
+        for index, ((image, alpha), target) in enumerate(zip(pictures, self.renders, strict=True)):
+            apart = image.double() - target.double()
             error = float(apart.square().mean())
-            if self.alphas is not None:
+            if self.alphas is not None and alpha is not None:
                 other = (1 - 2 * self.views.background).to(apart)  # from a background to its opposite
                 over_other = apart - (alpha - self.alphas[index]).double() * other
                 error = 0.5 * (error + float(over_other.square().mean()))
-            yield error
+            errors.append(error)
+            if progress is not None:
+                progress(len(errors) / len(self.renders))
+        return Closeness(tuple(errors), self.covered, self.views.width)
 
 
 class DenseReference(Reference):

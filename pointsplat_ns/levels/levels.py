@@ -137,8 +137,8 @@ class Levels:
         """
         dense, file, of = self.dense, self.source, self.views
         boxes = {"all": (dense.means.amin(dim=0), dense.means.amax(dim=0))}
-        if bool((dense.alphas > 0).any()):
-            boxes["content"] = content_box(dense)
+        if (content := content_box(dense)) is not None:
+            boxes["content"] = content
         views = None
         if of is not None:
             views = {"count": len(of), "origin": self.origin, "width": of.width, "height": of.height}

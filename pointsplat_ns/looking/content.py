@@ -8,7 +8,6 @@ import math
 import torch
 from torch import Tensor
 
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views
@@ -18,15 +17,13 @@ UNITS = 10.0
 against it."""
 
 
-def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64.
-
-    Raises DataError if nothing of the scene is visible.
-    """
+def content_box(scene: Gaussians) -> tuple[Tensor, Tensor] | None:
+    """Corners (3,), (3,) of the box that holds 90 % of the scene's opacity along each axis, scene units, float64; None
+    if nothing of the scene is visible."""
     means, alphas = scene.means.double(), scene.alphas.double()
     visible = scene.usable() & (alphas > 0)
     if not bool(visible.any()):
-        raise DataError("nothing of the scene can be seen, so there is no place to look from")
+        return None
     means, alphas = means[visible], alphas[visible]
     corners = []
     for axis in means.unbind(1):
@@ -38,36 +35,25 @@ def content_box(scene: Gaussians) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def content_size(scene: Gaussians, box: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, float]:
-    """Centre and diagonal of the content of a scene.
+def content_size(scene: Gaussians) -> tuple[Tensor, float]:
+    """Centre (3,), float64, on the CPU, and diagonal of the content of a scene, scene units.
 
-    Args:
-        scene: N Gaussians.
-        box: corners (3,), (3,) as :func:`content_box` gives them; by default they are computed.
-
-    Returns:
-        Centre (3,), float64, on the CPU, and diagonal, scene units. If the box is a point (one Gaussian, or all at one
-        position), the diagonal is four times the largest standard deviation, or 1 if that is 0 or not finite. Without
-        ``box``, a scene that shows nothing has its centre at 0 and a diagonal of 1.
+    If the content is a point (one Gaussian, or all at one position), the diagonal is four times the largest standard
+    deviation, or 1 if that is 0 or not finite. A scene that shows nothing has its centre at 0 and a diagonal of 1.
     """
-    try:
-        low, high = content_box(scene) if box is None else box
-    except DataError:
+    box = content_box(scene)
+    if box is None:
         return torch.zeros(3, **DOUBLES), 1.0
+    low, high = box
     size = float((high - low).norm()) or 4 * float(scene.stds[scene.usable()].double().amax())
     return 0.5 * (low + high).cpu(), size if 0 < size < math.inf else 1.0
 
 
-def positions_in_units(positions: Tensor, centre: Tensor, size: float) -> Tensor:
-    """Positions (..., 3) moved and scaled so that the content has its centre at 0 and a diagonal of :data:`UNITS`,
-    float64."""
-    return (positions.double() - centre.to(positions.device)) * (UNITS / size)
-
-
 def in_units(scene: Gaussians, centre: Tensor, size: float) -> Gaussians:
-    """A scene, moved and scaled as by :func:`positions_in_units`."""
-    means = positions_in_units(scene.means, centre, size).to(scene.dtype)
-    return scene.replace(means=means, scales=scene.scales + math.log(UNITS / size))
+    """A scene moved and scaled so that the content has its centre at 0 and a diagonal of :data:`UNITS`; positions are
+    computed in float64."""
+    means = (scene.means.double() - centre.to(scene.device)) * (UNITS / size)
+    return scene.replace(means=means.to(scene.dtype), scales=scene.scales + math.log(UNITS / size))
 
 
 def views_in_units(views: Views, centre: Tensor, size: float) -> Views:

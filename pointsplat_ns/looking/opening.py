@@ -1,7 +1,7 @@
 """The views in which people see a scene first: its subject whole and upright, or from where people stood.
 
 A person who opens a scene wants one picture that shows what it is, and then others. An object is shown whole: people
-are as likely to take a picture of all of it (:mod:`~pointsplat_ns.looking.candidates`) as others. In a room or
+are as likely to take a picture of all of it (:mod:`~pointsplat_ns.looking.sampling`) as others. In a room or
 outdoors, where nobody stands outside of everything, they are not.
 """
 
@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.content import UNITS, in_scene_units, views_in_units
-from pointsplat_ns.looking.poses import views_of
+from pointsplat_ns.looking.content import in_scene_units, views_in_units
+from pointsplat_ns.looking.poses import around, whole_views
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.whole import around, whole_views
 from pointsplat_ns.views import Views
 
 
@@ -59,28 +57,19 @@ def opening_views(
         DataError: if nothing of the scene is visible.
     """
     sampler = Sampler(scene, (width, height), up)
-    content, candidates = sampler.content, sampler.candidates
-    if known is None:
-        generator = torch.Generator().manual_seed(0)
-        others = views_of(candidates.views(24, generator), width, height, UNITS)
-    else:
-        others, width, height = views_in_units(known, *content), known.width, known.height
-
-    def outside(turns: Tensor) -> Views:
-        return whole_views(sampler.surface, sampler.up.direction, turns, 20.0, width, height)
-
-    turns = around(12)
-    whole_likelihoods, whole_shown = candidates.judged(outside(turns))
-    likelihoods, shown = candidates.judged(others)
+    others = sampler.views(24) if known is None else known
+    likelihoods, shown = sampler.judged(views_in_units(others, *sampler.content))
+    size = others.width, others.height
+    outside = whole_views(sampler.surface.points, sampler.up.direction, around(12), 20.0, *size)
+    whole_likelihoods, whole_shown = sampler.judged(outside)
     best = int(whole_likelihoods.argmax())
     if float(whole_likelihoods[best]) < float(likelihoods.median()):
-        taken = candidates.completing(likelihoods, shown, count)
-        views = in_scene_units(others, *content)[taken] if known is None else known[taken]
-        return Opening(views, sampler.up, False)
+        return Opening(others[sampler.completing(likelihoods, shown, count)], sampler.up, False)
+    outside = in_scene_units(outside, *sampler.content)
     if known is None:
-        return Opening(in_scene_units(outside(turns[best] + around(count)), *content), sampler.up, True)
-    taken = candidates.completing(likelihoods, shown & ~whole_shown[best], count - 1)
-    first = in_scene_units(outside(turns[best : best + 1]), *content)
-    viewmats = torch.cat([first.viewmats, known.viewmats[taken].to(first.viewmats)])
-    Ks = torch.cat([first.Ks, known.Ks[taken].to(first.Ks)])
+        sides, count = len(outside), min(count, len(outside))
+        return Opening(outside[[(best + sides * place // count) % sides for place in range(count)]], sampler.up, True)
+    taken = sampler.completing(likelihoods, shown & ~whole_shown[best], count - 1)
+    viewmats = torch.cat([outside.viewmats[best : best + 1], known.viewmats[taken].to(outside.viewmats)])
+    Ks = torch.cat([outside.Ks[best : best + 1], known.Ks[taken].to(outside.Ks)])
     return Opening(replace(known, viewmats=viewmats, Ks=Ks), sampler.up, True)

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from pointsplat_ns.looking.content import UNITS
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import Views
@@ -50,8 +51,43 @@ def views_of(viewmats: Tensor, width: int, height: int, diagonal: float) -> View
         diagonal: of the content, in the unit of ``viewmats``; the near plane is a thousandth of it away.
     """
     focal = 0.5 * max(width, height) / math.tan(math.radians(LOOKING.field_of_view) / 2)
-    K = torch.tensor(
-        [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=viewmats.dtype, device="cpu"
-    )
+    K = viewmats.new_tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     Ks = K.repeat(len(viewmats), 1, 1)
     return Views(viewmats, Ks, width, height, torch.zeros(3, **FLOATS), near_plane=1e-3 * diagonal)
+
+
+def level_directions(up: Tensor, turn: Tensor) -> Tensor:
+    """Directions (n, 3) at a right angle to ``up`` (3,), at angles (n,) around it, radians."""
+    right = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype, device="cpu")[up.abs().argmin()])
+    right = right / right.norm()
+    return turn.cos()[:, None] * right + turn.sin()[:, None] * torch.linalg.cross(up, right)
+
+
+def whole_views(points: Tensor, up: Tensor, turns: Tensor, elevation: float, width: int, height: int) -> Views:
+    """Views from around the content, each as near as the whole of it allows; float64, units.
+
+    Args:
+        points: (M, 3) of the content, units.
+        up: (3,) direction that is up, of length 1.
+        turns: (n,) angles of the cameras around it, radians.
+        elevation: of the cameras above the content, degrees.
+        width, height: size of the pictures, pixels.
+    """
+    level = torch.stack([*level_directions(up, up.new_tensor([0.0, math.pi / 2])), up])  # [3, 3] rows
+    quantiles = points.new_tensor([0.005, 0.995])  # what lies beyond is no part of the subject
+    middle = (points @ level.T).quantile(quantiles, dim=0).mean(0) @ level
+    lift = math.radians(elevation)
+    sides = math.cos(lift) * level_directions(up, turns.to(up)) + math.sin(lift) * up
+    viewmats = look_at(sides, torch.zeros_like(sides), up)
+    x, y, z = (viewmats[:, :3, :3] @ (points - middle).T).unbind(1)  # [n, M]
+    reach = math.tan(math.radians(LOOKING.field_of_view) / 2) / max(width, height)
+    across, along = 0.92, 0.88  # largest shares of the picture's width and height that the subject takes
+    needed = torch.maximum(x.abs() / (across * width * reach), y.abs() / (along * height * reach)) - z
+    distances = needed.quantile(quantiles[1], dim=1).clamp_min(0.1)
+    viewmats = look_at(middle + distances[:, None] * sides, middle.expand_as(sides), up)
+    return views_of(viewmats, width, height, UNITS)
+
+
+def around(count: int) -> Tensor:
+    """Angles (count,) all around, radians."""
+    return torch.arange(count, **FLOATS) * (2 * math.pi / count)

@@ -1,8 +1,7 @@
 """The settings of looking: tuned numbers that results depend on, with their meaning and their unit.
 
-Numbers that results hardly depend on stand beside their formula. A field says how its rule is turned off, where it
-stands for a rule of its own. A unit is a tenth of the diagonal of the scene's content, see
-:data:`~pointsplat_ns.looking.content.UNITS`. ``lab/judge/ablation.py`` measures what fields are worth.
+Numbers that results hardly depend on stand in their formula. A unit is a tenth of the diagonal of the scene's content,
+see :data:`~pointsplat_ns.looking.content.UNITS`. ``lab/judge/ablation.py`` measures what fields are worth.
 """
 
 from __future__ import annotations
@@ -16,40 +15,24 @@ from dataclasses import dataclass
 class LookingSettings:
     """Settings of :mod:`pointsplat_ns.looking`."""
 
-    # Outliers (surface.py, traces.py)
-
-    outlier_quantiles: tuple[float, float] = (0.02, 0.98)
-    """Quantiles of positions beyond which Gaussians or points count as outliers; (0, 1) keeps all."""
-
-    max_area_quantile: float = 0.99
-    """Quantile that bounds the area of Gaussians where areas are weights, so that a few giants do not count for all; 1
-    turns the bound off."""
-
-    # Cameras (poses.py)
-
     field_of_view: float = 70.0
     """Field of view across the longer side of a sampled view, degrees: that of a phone's main camera."""
 
-    # Trace factors (traces.py)
+    # Traces of photos (traces.py)
 
     trace_neighbourhood: int = 129
     """Number of Gaussians along a space-filling curve over which traces are averaged, odd. One Gaussian says little."""
 
     energy_exponent: float = 0.75
-    """Exponent of the mean energy of the SH in a trace factor; 0 turns it off. Fitted, together with that of the
-    flatness, to the poses of four captures."""
+    """Exponent of the mean energy of the SH in a trace factor; 0 turns it off. Fitted, with the next, to the poses of
+    four captures."""
 
     flatness_exponent: float = 1.0
-    """Exponent of the mean flatness in a trace factor; 0 turns it off."""
-
-    flatness_exponent_without_sh: float = 2.0
-    """Exponent of the mean flatness in scenes without SH; 0 turns it off."""
+    """Exponent of the mean flatness in a trace factor, twice that in scenes without SH; 0 turns it off."""
 
     max_log_factor: float = 8.0
     """Bound of the absolute value of the logarithm of a trace factor; 0 turns trace factors off. Without them six
-    captures lose 0.1 dB on average at 10 %, four of them 0.2 to 0.4, and one gains 0.5."""
-
-    # Photo places (traces.py)
+    captures lose 0.1 to 0.2 dB on average at 10 %, two of them 0.4 to 0.5, and one gains 0.2."""
 
     evidence_count: int = 1_500
     """Largest number of Gaussians whose SH are compared with candidate places."""
@@ -58,57 +41,42 @@ class LookingSettings:
     """Exponent of the evidence of a place in its share."""
 
     min_sh_evidence: float = 2.0
-    """Smallest evidence of the best place by SH, explained energy relative to SH of random directions, for photo places
-    to count in the estimate of up and in weights; infinity turns that off. Captures reach 3.3 to 3.7 at photo places.
-    Scenes seen from all around reach 1.2 to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB).
-    ``lab/training/photo_places.py`` prints it."""
+    """Smallest evidence of the best place by SH, explained energy relative to SH of random directions, for trace
+    factors to count; infinity turns them off. Captures reach 3.3 to 3.7 at photo places. Scenes seen from all around
+    reach 1.2 to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB)."""
 
     min_size_evidence: float = 0.48
     """The same in scenes without SH, by the correlation of the logarithms of size and distance. Captures from outside
-    reach 0.50 to 0.78, rooms, where any free place will do, 0.23 to 0.46. ``lab/training/photo_places.py`` prints
-    it."""
-
-    # Surface points (surface.py)
-
-    min_opacity: float = 0.1
-    """Smallest opacity of the Gaussians that points are drawn from, if there are any, and of those that are compared
-    with candidate places: a haze hides nothing; 0 turns the rule off."""
-
-    surface_exponent: float = 0.5
-    """Exponent of opacity times area in the chance of a Gaussian to get a point. 0 counts Gaussians, which are many
-    where photos show detail; 1 counts their area. 1 loses 0.2 to 0.3 dB in two of four scenes and gains 0.1 in one."""
+    reach 0.50 to 0.78, rooms, where any free place will do, 0.23 to 0.46."""
 
     # Up (upright.py)
 
-    usual_axis_factors: tuple[float, float] = (1.32, 1.25)
-    """Factor of the uprightness of the world's axes, as most files stand along one, and a further one of y, as most
-    have -y up; (0, 1) turns the rule off. 18 files and the example room, turned so that up lies on each of six
-    directions, stand along the right axis in 100 cases of 114. With (1.32, 1), two rooms whose walls are as flat as
-    their floors are always wrong, also as they come, and all others right. With photo places it is (1.05, 1)."""
-
-    photo_direction_weight: float = 0.1
-    """Weight of the mean evidence for photos from both ends of an axis, which lowers its uprightness; 0 turns it off.
-    The fox's up is 8 degrees wrong with it, 12 without it, and 24 with the levelness of photo places instead."""
+    usual_axis_factors: tuple[float, float, float] = (1.32, 1.65, 1.32)
+    """Factors of the uprightness of the world's axes: most files stand along one, and most have -y up. (0, 0, 0) turns
+    the rule off. 18 files and the example room, turned so that up lies on each of six directions, stand along the right
+    axis in 100 cases of 114. With 1.32 for y, two rooms whose walls are as flat as their floors are always wrong, also
+    as they come, and all others right."""
 
     min_seen_from_above: float = 0.25
     """Smallest absolute value of the logarithm of the ratio of the Gaussians that are seen from above to those that are
-    seen from below, for it to decide between a direction and its opposite; infinity turns the rule off. People
-    photograph from above, and floors hide what is below them. The ratio is right in all of 27 captures and splats, most
-    narrowly for a robot over a meadow (0.106), and wrong in a closed synthetic room (0.23)."""
+    seen from below, for it to decide; infinity turns the rule off. People photograph from above, and floors hide what
+    is below them. It is right in all of 27 captures and splats, most narrowly for a robot over a meadow (0.106), and
+    wrong in a closed synthetic room (0.23)."""
 
-    # Candidate views (candidates.py)
+    # Views (sampling.py)
 
     sampled_count: int = 250_000
     """About the largest number of Gaussians in which views are looked for; of more, every second (third, ...) is."""
+
+    min_opacity: float = 0.1
+    """Smallest opacity of the Gaussians that are looked at and compared with candidate places, if there are any: a haze
+    hides nothing; 0 turns the rule off."""
 
     candidate_gaussians: int = 10_000
     """About the largest number of Gaussians in the pictures of candidates."""
 
     candidate_side: int = 64
     """Longer side of these pictures, pixels."""
-
-    min_candidate_pixels: float = 0.02
-    """Smallest sum of blend weights over the pixels of such a picture for it to show a Gaussian, pixels."""
 
     candidates_per_view: int = 8
     """Number of candidates for each view."""

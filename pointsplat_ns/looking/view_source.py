@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
@@ -76,11 +75,6 @@ class ViewSource:
         return f"views: {self.origin}"
 
     @property
-    def resolution(self) -> tuple[int, int]:
-        """Width and height of sampled views, pixels."""
-        return self._resolution or RESOLUTION
-
-    @property
     def given(self) -> Views | None:
         """The views that were given, if any."""
         return self._given if self._given is not None and len(self._given) else None
@@ -99,47 +93,37 @@ class ViewSource:
             self.missing = f" (no dataset: {error})"
             return None
 
-    def views(self, count: int) -> Views:
-        """At most ``count`` views: given ones, those of the dataset's training poses, or sampled ones.
-
-        Raises:
-            DataError: if the given views are empty, or none can be sampled.
-        """
-        if self._given is not None:
-            if len(self._given) == 0:
-                raise DataError("the views given are empty; expected at least one view")
-            self.origin = "given views"
-            return self._at_resolution(self._given.spread(count))
-        if self._of_dataset is not None:
-            self.origin = "poses of the dataset"
-            return self._at_resolution(self._of_dataset.spread(count))
-        views = self.sampler.views(count)
-        self.origin = f"sampled poses, up is {self.up}{self.missing}"
-        return views
-
-    @cached_property
-    def sampler(self) -> Sampler:
-        """The sampler of the scene."""
-        return Sampler(self._scene, self.resolution, self._up)
-
-    @property
-    def up(self) -> Up:
-        """Which way is up in the scene.
-
-        Raises:
-            DataError: if it has to be estimated, and nothing of the scene is visible.
-        """
-        return self.sampler.up
-
     @property
     def _known(self) -> Views | None:
-        """All known views: given ones, or those of the dataset's training poses; None if there are none."""
+        """All known views."""
         return self._of_dataset if self.given is None else self.given
 
     def known(self, count: int) -> Views | None:
         """At most ``count`` known views: given ones, or those of the dataset's training poses; None if there are
         none."""
-        return None if self._known is None else self.views(count)
+        if self._known is None:
+            return None
+        self.origin = "poses of the dataset" if self.given is None else "given views"
+        return self._at_resolution(self._known.spread(count))
+
+    def views(self, count: int) -> Views:
+        """At most ``count`` known views, or sampled ones.
+
+        Raises:
+            DataError: if the given views are empty, or none can be sampled.
+        """
+        if self._given is not None and self.given is None:
+            raise DataError("the views given are empty; expected at least one view")
+        views = self.known(count)
+        if views is None:
+            views = self.sampler.views(count)
+            self.origin = f"sampled poses, up is {self.sampler.up}{self.missing}"
+        return views
+
+    @cached_property
+    def sampler(self) -> Sampler:
+        """The sampler of the scene."""
+        return Sampler(self._scene, self._resolution or RESOLUTION, self._up)
 
     def for_merging(self) -> Views | Sampler:
         """At most :data:`VIEW_COUNTS.weighed` known views; the sampler if there are none."""
@@ -180,46 +164,32 @@ class ViewSource:
         Raises:
             DataError: if none can be sampled.
         """
-        compared, left = self.compared(), self._not_compared()
-        if left is None:
+        known, compared = self._known, self.compared()
+        every = 0 if known is None else len(known)
+        left = sorted(set(range(every)) - set(spread_indices(every, VIEW_COUNTS.compared)))
+        if known is None or not left:
             yield from self.sampled(seed, count)
-        elif len(left) > len(compared):
-            yield from self._in_turn(left, seed)
+            return
+        others = _in_turn(self._at_resolution(known)[left], seed)
+        if len(left) > len(compared):
+            yield from others
         else:
-            for pair in zip(self._in_turn(left, seed), self.sampled(seed, count), strict=False):  # neither ends
+            for pair in zip(others, self.sampled(seed, count), strict=False):  # neither ends
                 yield from pair
 
-    def _not_compared(self) -> Views | None:
-        """The known views that are none of the :meth:`compared` ones; None if there are none."""
-        if (known := self._known) is None:
-            return None
-        left = sorted(set(range(len(known))) - set(spread_indices(len(known), VIEW_COUNTS.compared)))
-        return self._at_resolution(known)[left] if left else None
-
     def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
-        """Sampled views without end, in the order and of the sizes of :meth:`others`.
-
-        Args:
-            seed: of the order, and of the sampler.
-            count: number of different ones.
-
-        Raises:
-            DataError: if none can be sampled.
-        """
-        compared = self.compared()
-        views = dataclasses.replace(
-            self.sampler.views(count, seed + 1),
-            background=compared.background,
-            rasterize_mode=compared.rasterize_mode,
-        )
-        for turn, view in enumerate(self._in_turn(views, seed)):
+        """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the arguments."""
+        compared, views = self.compared(), self.sampler.views(count, seed + 1)
+        views = replace(views, background=compared.background, rasterize_mode=compared.rasterize_mode)
+        for turn, view in enumerate(_in_turn(views, seed)):
             opposite = self._known is None and turn % 5 == 4  # the viewer's background is unknown
-            yield dataclasses.replace(view, background=1 - view.background) if opposite else view
+            yield replace(view, background=1 - view.background) if opposite else view
 
-    def _in_turn(self, views: Views, seed: int) -> Iterator[View]:
-        """Views in random order, each once before any is repeated, then of the other size; without end. A view that
-        comes again is the same object."""
-        sizes, generator = [[*of_size] for of_size in two_sizes(views)], random.Random(seed)
-        for lap in counted():
-            for index in generator.sample(range(len(views)), len(views)):
-                yield sizes[(lap + index) % 2][index]
+
+def _in_turn(views: Views, seed: int) -> Iterator[View]:
+    """Views in random order, each once before any is repeated, then of the other size; without end. A view that comes
+    again is the same object."""
+    sizes, generator = [[*of_size] for of_size in two_sizes(views)], random.Random(seed)
+    for lap in counted():
+        for index in generator.sample(range(len(views)), len(views)):
+            yield sizes[(lap + index) % 2][index]

@@ -48,12 +48,12 @@ def views_and_weights(
         No views for a small scene without known ones, if nothing is visible, or if no view is asked for. Where traces
         show where the scene's photos were taken, weights are multiplied by :mod:`~pointsplat_ns.looking.traces`.
     """
-    found, photos_found = (views if isinstance(views, Views) else None), False
+    found, traced = (views if isinstance(views, Views) else None), False
     if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:
         sampler = views or Sampler(participants.scene)
         with contextlib.suppress(DataError):
             found = sampler.views(settings.sampled_views, settings.view_seed)
-            photos_found = sampler.photos is not None
+            traced = sampler.traced
     report(0.6)
     scene, members = participants.scene, participants.members
     weights = torch.ones(len(members), **FLOATS)
@@ -65,7 +65,7 @@ def views_and_weights(
         looks = views_in_units(found, *unit)
         each = covered_per_area(drawn, rows, looks, settings, lambda share: report(0.6 + 0.4 * share))
         weights = each.repeat_interleave(step)[: len(members)]
-    return found, weights * trace_factors(scene, members) if photos_found else weights
+    return found, weights * trace_factors(scene, members) if traced else weights
 
 
 def covered_per_area(

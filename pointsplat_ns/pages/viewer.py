@@ -40,7 +40,7 @@ class _Stage:
         self.scenes, self.number = scenes, number
         first = scenes[0]
         known = first.source.known(VIEW_COUNTS.opening)
-        self.frame = FlightFrame.of(first.scene, known, first.source.up if up is None and known is None else up)
+        self.frame = FlightFrame.of(first.scene, known, first.source.sampler.up if up is None and known is None else up)
         found = f"the view that shows most, up is {self.frame.up}{first.source.missing}"
         self.origin = found if known is None else first.source.origin
         shown = [{"name": viewed.name, "amount": ""} for viewed in scenes]

@@ -26,12 +26,9 @@ from pointsplat_ns.io.camera_files.cameras import Motion
 from pointsplat_ns.io.camera_files.colmap import colmap_points
 from pointsplat_ns.io.files import logger
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.photos.pose_check import POSE_CHECK, Likeness, Photo, likeness
+from pointsplat_ns.photos.pose_check import MIN_LIKENESS, POSE_CHECK, Likeness, Photo, likeness
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import Views, spread_indices
-
-LEAST_LIKENESS = 0.5
-"""Least mean correlation of renders and their photos."""
 
 SAME_SCALE = 0.02
 """Deviation of a scale from 1 that is left as it is."""
@@ -85,7 +82,7 @@ def in_frame(scene: Gaussians, named: NamedViews, photos: Mapping[int, Photo], m
 def _fits(found: Likeness) -> bool:
     """Whether renders are like their photos, and more than like the photos of other views, which show the same object
     or sky: by three tenths of what is possible. Right frames have eight tenths and more."""
-    return found.own >= max(LEAST_LIKENESS, found.others + 0.3 * (1 - found.others))
+    return found.own >= max(MIN_LIKENESS, found.others + 0.3 * (1 - found.others))
 
 
 class _Search:
@@ -142,7 +139,7 @@ def _best_scale(likeness_at: Callable[[float], float]) -> float:
     """The scale of positions with the greatest likeness: uphill by ever smaller steps, from 1 or, where that is
     unlike, from the best of a hundredth to a hundred."""
     scale = 1.0
-    if likeness_at(scale) < LEAST_LIKENESS:
+    if likeness_at(scale) < MIN_LIKENESS:
         scale = max((1.25**power for power in range(-20, 21)), key=likeness_at)
     for step in (1.1, 1.01, 1.002):
         at = functools.cache(lambda power, start=scale, step=step: likeness_at(start * step**power))

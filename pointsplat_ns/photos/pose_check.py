@@ -4,6 +4,10 @@ A view that belongs to a scene shows it, and sharp: training leaves Gaussians of
 camera in a wrong frame looks past the scene, or stands in front of a few large Gaussians. Where there are photos, a
 render is more like its own photo than like the others; likeness is a correlation, so that exposure and opacity do not
 count. Wrong frames that look much like the right one (a room upside down, a smaller scale) are found by photos alone.
+
+Thresholds are chosen on four scenes of three captures in the poses of their photos, and on twelve splats in sampled
+views. All pass, the splats merged to 1 % as well. Of 13 wrong frames, renders alone tell two to eleven; photos tell all
+but one of 52.
 """
 
 from __future__ import annotations
@@ -27,9 +31,7 @@ from pointsplat_ns.views import View, Views
 
 @dataclass(frozen=True)
 class PoseCheckSettings:
-    """Settings of the check, chosen on four scenes of three captures in the poses of their photos, and on twelve splats
-    in sampled views. All pass, the splats merged to 1 % as well. Of 13 wrong frames, renders alone tell two to eleven;
-    photos tell all but one of 52."""
+    """What is drawn for the check."""
 
     views: int = 8
     """Largest number of views that are drawn."""
@@ -37,23 +39,12 @@ class PoseCheckSettings:
     """Longer side of their pictures, pixels."""
     max_count: int = 200_000
     """About how many Gaussians are drawn at most: every k-th, enlarged."""
-    min_covered: float = 0.01
-    """Least share of a picture that the scene covers. Objects of captures cover 5 % and more."""
-    sharp_share: float = 0.25
-    """Share of a picture that has to be sharp. The rest may be a sky, or out of focus."""
-    max_angle: float = 0.03
-    """Angle that standard deviations of sharp Gaussians subtend at most, radians."""
-    coarse_angle: float = 5.0
-    """The same in units of the median size at half the diagonal of the content, if that is more: of scenes of few
-    Gaussians. The largest of right poses is 3."""
-    min_likeness: float = 0.5
-    """Mean correlation of renders and their photos that is enough by itself."""
-    min_advantage: float = 0.2
-    """Least advantage of this correlation over that of renders and the photos of other views. Right poses have 0.43 and
-    more, wrong frames up to 0.3: a kitchen at half the scale."""
 
 
 POSE_CHECK = PoseCheckSettings()
+
+MIN_LIKENESS = 0.5
+"""Mean correlation of renders and their photos that is enough by itself."""
 
 
 @dataclass(frozen=True)
@@ -77,39 +68,40 @@ class PoseFaults:
 
 
 @torch.no_grad()
-def pose_faults(scene: Gaussians, views: Views, settings: PoseCheckSettings = POSE_CHECK) -> PoseFaults:
+def pose_faults(scene: Gaussians, views: Views) -> PoseFaults:
     """What is wrong with the views of a scene, found by small renders. A scene that shows nothing has no fault.
 
-    Args:
-        scene: N Gaussians.
-        views: C views.
+    A view shows something if the scene covers a hundredth of its picture; objects of captures cover 5 % and more. It
+    is sharp if on a quarter of what is covered (the rest may be a sky, or out of focus) Gaussians subtend at most 0.03
+    radians, or, in scenes of few Gaussians, five times what one of the median size does at half the diagonal of the
+    content; the largest of right poses is three times.
     """
     visible = scene.usable() & (scene.alphas >= ALPHA_MIN)
     if not bool(visible.any()) or len(views) == 0:
         return PoseFaults(0, 0, 0)
     every = scene[visible]
-    drawn, step = thinned(every, settings.max_count), thinning(len(every), settings.max_count)
+    drawn, step = thinned(every, POSE_CHECK.max_count), thinning(len(every), POSE_CHECK.max_count)
     stds = every[::step].stds.double().sort(dim=1).values
     widths = (stds[:, 1] * stds[:, 2]).sqrt()  # scene units
-    limit = max(settings.max_angle, settings.coarse_angle * float(widths.median()) / (0.5 * content_size(drawn)[1]))
+    limit = max(0.03, 5.0 * float(widths.median()) / (0.5 * content_size(drawn)[1]))
     empty = smeared = 0
-    checked = views.spread(settings.views)
-    for view in replace(checked.resized(settings.side), rasterize_mode="antialiased"):
+    checked = views.spread(POSE_CHECK.views)
+    for view in replace(checked.resized(POSE_CHECK.side), rasterize_mode="antialiased"):
         pixels = pixels_of(drawn, view).double()
-        if float(pixels.sum()) < settings.min_covered * view.width * view.height:
+        if float(pixels.sum()) < 0.01 * view.width * view.height:
             empty += 1
-        elif _angle(drawn, widths, pixels, view, settings.sharp_share) > limit:
+        elif _sharpest_angle(drawn, widths, pixels, view) > limit:
             smeared += 1
     return PoseFaults(len(checked), empty, smeared)
 
 
-def _angle(scene: Gaussians, widths: Tensor, pixels: Tensor, view: View, share: float) -> float:
-    """The angle, radians, that a share of a picture stays below: that of the width of the Gaussian on each pixel."""
+def _sharpest_angle(scene: Gaussians, widths: Tensor, pixels: Tensor, view: View) -> float:
+    """The angle, radians, that a quarter of a picture stays below: that of the width of the Gaussian on each pixel."""
     viewmat = view.viewmat.to(widths)
     distances = (scene.means.double() @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
     angles, order = (widths / distances.clamp_min(torch.finfo(torch.float64).tiny)).sort()
     below = pixels[order].cumsum(0)
-    return float(angles[torch.searchsorted(below, share * below[-1]).clamp_max(len(angles) - 1)])
+    return float(angles[torch.searchsorted(below, 0.25 * below[-1]).clamp_max(len(angles) - 1)])
 
 
 @dataclass(frozen=True)
@@ -125,10 +117,12 @@ class Likeness:
     count: int
     """Number of photos."""
 
-    def text(self, settings: PoseCheckSettings = POSE_CHECK) -> str:
-        """What is wrong, for an error; empty if renders are like their own photos, or there is none."""
-        close = self.own >= settings.min_likeness or self.own - self.others >= settings.min_advantage
-        if self.count == 0 or close:
+    @property
+    def text(self) -> str:
+        """What is wrong, for an error; empty if renders are like their own photos, or there is none. Right poses have
+        an advantage of 0.43 and more over the photos of other views, wrong frames up to 0.3: a kitchen at half the
+        scale."""
+        if self.count == 0 or self.own >= MIN_LIKENESS or self.own - self.others >= 0.2:
             return ""
         return (
             f"renders of the scene are no more like the photos of their views than like others ({self.psnr:.1f} dB "
@@ -141,17 +135,12 @@ Photo = tuple[View, Tensor, Tensor | None]
 
 
 @torch.no_grad()
-def likeness(scene: Gaussians, photos: Sequence[Photo], settings: PoseCheckSettings = POSE_CHECK) -> Likeness:
-    """How much small renders of a scene are like photos. Masked pixels do not count.
-
-    Args:
-        scene: N Gaussians.
-        photos: with their views.
-    """
-    drawn = thinned(scene, settings.max_count)
+def likeness(scene: Gaussians, photos: Sequence[Photo]) -> Likeness:
+    """How much small renders of a scene are like photos. Masked pixels do not count."""
+    drawn = thinned(scene, POSE_CHECK.max_count)
     shown, taken, psnrs = [], [], []
     for view, photo, mask in photos:
-        k = max(1, max(view.width, view.height) // settings.side)
+        k = max(1, max(view.width, view.height) // POSE_CHECK.side)
         size = max(1, view.height // k), max(1, view.width // k)
         stretch = view.K.new_tensor([[size[1] / view.width], [size[0] / view.height], [1.0]])
         small = replace(view, K=view.K * stretch, width=size[1], height=size[0])

@@ -61,44 +61,31 @@ def read_with_photos(
     progress: Progress = silent,
     training: bool = True,
 ) -> tuple[Gaussians, PosedPhotos]:
-    """Read a scene, and the photos in a folder; arguments as of :func:`read_posed_photos`. Raises SceneError if
-    ``poses`` is no path or None, or the ``data`` of a run is named besides."""
-    if not (poses is None or isinstance(poses, (str, Path))) or without_poses(poses):
-        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
-    if data is not None:
-        raise SceneError(f"{data}: the data of a run, but photos are read from {folder}; expected one of both")
-    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
-    return dense, read_posed_photos(dense, folder, poses, path, resolution, progress, training)
-
-
-def read_posed_photos(
-    dense: Gaussians,
-    folder: Path | str,
-    poses: Path | str | None = None,
-    scene: Path | None = None,
-    resolution: tuple[int, int] | None = None,
-    progress: Progress = silent,
-    training: bool = True,
-) -> PosedPhotos:
-    """Read the photos in a folder, reduced to the resolution; they stay in memory, a byte a channel. Photos that cannot
-    be used are named and left out.
+    """Read a scene, and the photos in a folder, reduced to the resolution; they stay in memory, a byte a channel.
+    Photos that cannot be used are named and left out.
 
     Args:
-        dense: N Gaussians.
+        scene: N Gaussians, or the path of a scene, beside which cameras and ``dataparser_transforms.json`` are looked
+            for.
         folder: of the photos.
         poses: a file of cameras; by default one in the folder of the photos, above it, or beside the scene.
-        scene: file of the scene, beside which cameras and ``dataparser_transforms.json`` are looked for.
+        data: of a run; expected to be None.
         resolution: width and height, pixels; the longer side bounds that of photos. By default 1600.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
         training: whether to read the photos that are not held out.
 
     Raises:
+        SceneError: if ``poses`` is no path or None, or ``data`` is named.
         DataError: if there are no photos or poses, too few of them belong together, or renders of the scene are not
             like the photos in any frame that was tried; if most photos cannot be used, or they take more memory than
             is free.
     """
-    folder = Path(folder)
-    model, named, files = _posed_files(folder, poses, scene)
+    if not (poses is None or isinstance(poses, (str, Path))) or without_poses(poses):
+        raise SceneError(f"{folder}: photos need the file with their poses; expected its path, or none to look for it")
+    if data is not None:
+        raise SceneError(f"{data}: the data of a run, but photos are read from {folder}; expected one of both")
+    dense, path = (scene, None) if isinstance(scene, Gaussians) else (read_scene(scene), Path(scene))
+    model, named, files = _posed_files(folder, poses, path)
     order = sorted(files, key=lambda index: named.names[index])
     held = order[::8]
     side = 1600 if resolution is None else max(resolution)  # as in 3DGS training
@@ -141,7 +128,7 @@ def read_posed_photos(
         bytes_text(sum(sizes[index] for index in examples)),
     )  # fmt: skip
     apart = [examples[i] for i in good if i in held]
-    return PosedPhotos(views.resized(side), [examples[i] for i in good if i not in held], apart, model)
+    return dense, PosedPhotos(views.resized(side), [examples[i] for i in good if i not in held], apart, model)
 
 
 def held_out_text(dense: Gaussians, results: Sequence[Gaussians], photos: Photos) -> str:

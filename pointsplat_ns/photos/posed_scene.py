@@ -16,17 +16,6 @@ from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.photos.pose_check import POSE_CHECK, Photo, likeness, pose_faults
 from pointsplat_ns.views import Views, spread_indices
 
-
-def read_posed(scene: Gaussians | Path | str, poses: Path | str) -> tuple[Gaussians, Views]:
-    """Read a scene and its views. The file of cameras is read first; then both are checked against each other. Errors
-    are those of :meth:`PosesFile.of`, :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
-    found = PosesFile.of(scene, poses)
-    dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
-    found = found.relative_to(dense.offset)
-    found.check(dense)
-    return dense, found.views
-
-
 NO_POSES = "none"
 """In place of a file of cameras: views are sampled, whatever lies beside the scene."""
 
@@ -57,10 +46,15 @@ def poses_nearby(path: Path, scene: Gaussians) -> PosesFile | None:
 
 
 def read_found(scene: Gaussians | Path | str, poses: Path | str | None) -> tuple[Gaussians, Views | None, Path | None]:
-    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. Errors are
-    those of :func:`read_posed`."""
+    """Read a scene, and its views if a file of cameras is given or lies nearby, and the path of that file. A given one
+    is read before the scene; then both are checked against each other. Errors are those of :meth:`PosesFile.of`,
+    :func:`~pointsplat_ns.io.read_scene` and :meth:`PosesFile.check`."""
     if poses is not None and not without_poses(poses):
-        return *read_posed(scene, poses), Path(poses)
+        given = PosesFile.of(scene, poses)
+        dense = scene if isinstance(scene, Gaussians) else read_scene(scene)
+        given = given.relative_to(dense.offset)
+        given.check(dense)
+        return dense, given.views, given.path
     if isinstance(scene, Gaussians):
         return scene, None, None
     path = Path(scene)
@@ -111,7 +105,7 @@ class PosesFile:
                 scene without a visible Gaussian is not refused here.
         """
         photos = self._photos()
-        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text()
+        wrong = pose_faults(scene, self.views).text or likeness(scene, photos).text
         if not wrong:
             return bool(photos)
         mend = (
@@ -141,7 +135,7 @@ def check_photos(scene: Gaussians, photos: Sequence[Photo], data: Path | str) ->
     """Raise a DataError if renders of a scene are not like the photos of its training, a few of which are read;
     ``data`` is the path of these."""
     some = [photos[index] for index in spread_indices(len(photos), POSE_CHECK.views)]
-    if wrong := likeness(scene, some).text():
+    if wrong := likeness(scene, some).text:
         raise DataError(
             f"{data}: {wrong}; the photos or their poses are probably not those of the training: put back the data as "
             "it was, or name the folder where it is now (--data DIR)"

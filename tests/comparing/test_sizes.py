@@ -56,10 +56,6 @@ def test_what_is_no_resolution_is_refused(text):
         parse_resolution(text)
 
 
-def test_a_resolution_is_read():
-    assert parse_resolution(" 640X480".strip()) == (640, 480) and parse_resolution(None) is None
-
-
 SCENE = cloud(200)
 
 

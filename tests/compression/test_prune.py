@@ -72,6 +72,6 @@ def test_merging_stands_upright_in_views_that_are_sampled_for_it():
     source = ViewSource(scene, resolution=(64, 48), up=up_named("x"))
     looked = source.for_merging().views(MERGING.sampled_views, MERGING.view_seed)
     assert (looked.width, looked.height) == (64, 48)
-    steep = (looked.viewmats[:, 2, :3] @ source.up.direction).abs() > 0.99  # level has no meaning there
-    level = looked.viewmats[~steep, 0, :3] @ source.up.direction  # no camera is rolled about its axis
+    steep = (looked.viewmats[:, 2, :3] @ source.sampler.up.direction).abs() > 0.99  # level has no meaning there
+    level = looked.viewmats[~steep, 0, :3] @ source.sampler.up.direction  # no camera is rolled about its axis
     assert int(steep.sum()) <= 6 and float(level.abs().max()) < 1e-6

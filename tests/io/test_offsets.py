@@ -13,7 +13,7 @@ from plys import columns_of, write_columns
 import pointsplat_ns as ps
 from making import ball, cloud, same_bits
 from pointsplat_ns.io.offsets import offset_for
-from pointsplat_ns.photos.posed_scene import read_posed
+from pointsplat_ns.photos.posed_scene import read_found
 from posing import inria, written
 
 UTM = (451_234.6, 5_412_345.7, 312.4)
@@ -118,7 +118,7 @@ def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
     with_doubles(scene, tmp_path / "a.ply")
     views = ps.sample_views(scene, 3, width=96, height=64)
     written(inria(at_utm(views)), tmp_path / "cameras.json")
-    dense, given = read_posed(tmp_path / "a.ply", tmp_path / "cameras.json")
+    dense, given, _ = read_found(tmp_path / "a.ply", tmp_path / "cameras.json")
     with torch.no_grad():
         assert float(ps.psnr(ps.render(dense, given), ps.render(scene, views)).mean()) > 50
 

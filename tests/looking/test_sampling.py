@@ -1,20 +1,24 @@
-"""Sampled cameras."""
+"""Sampled cameras: how likely they are, and what they show."""
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from upright_scenes import TURNS, room, tower, turned
 
-from making import box_room
+from making import ball, box_room, splats
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking import sampling
-from pointsplat_ns.looking.poses import look_at
+from pointsplat_ns.looking.content import UNITS, content_size, in_units, views_in_units
+from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.looking.traces import PhotoTraces
+from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.rasterizer import pixels_of, render
+from pointsplat_ns.views import Views
 
 
 def places_of(views):
@@ -118,29 +122,75 @@ def test_views_do_not_depend_on_the_unit_of_length(make, factor):
     assert torch.allclose(render(scene, one), render(other, two), atol=0.02)
 
 
-def test_a_view_that_a_few_large_gaussians_fill_is_not_taken(make_hollow_ball):
-    """A ball of small Gaussians with a cloud of large ones beside it: nobody takes photos from within a cloud."""
-    generator = torch.Generator().manual_seed(5)
-    ball = make_hollow_ball(6000)
-    ball = ball.replace(scales=ball.scales - 1.5)
-    cloud = make_hollow_ball(60)
-    middle = ball.means.mean(0) + torch.tensor([6.0, 0.0, 0.0])
-    means = middle + 1.5 * torch.randn(60, 3, generator=generator)
-    cloud = cloud.replace(means=means, scales=torch.full_like(cloud.scales, -0.3))
-    scene = Gaussians(*(torch.cat(pair) for pair in zip(ball.tensors(), cloud.tensors(), strict=True)))
-    views = sample_views(scene, 8, 96, 72)
-    subtended = []
-    for view in views:
-        shares = pixels_of(scene, view)
-        away = (scene.means.double() - places_of(views).mean(0)).norm(dim=1)
-        subtended.append(float((shares * scene.stds.amax(1) / away).sum() / shares.sum()))
-    assert len(views) >= 1 and max(subtended) < 0.2
-
-
 def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it(monkeypatch):
     scene = box_room(0, 3000)
     whole = Sampler(scene).content
-    monkeypatch.setattr(sampling, "LOOKING", dataclasses.replace(LOOKING, sampled_count=700))
+    monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=700))
     few = Sampler(scene, (64, 48))
     assert len(few.scene) == 750 and len(few.views(3)) == 3
     assert few.content[1] == pytest.approx(whole[1], rel=0.05)
+
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def wall(count: int = 3000, size: float = 0.06) -> Gaussians:
+    """A wall of flat Gaussians at y = 0, without SH."""
+    at = 8 * torch.rand(count, 2, generator=torch.Generator().manual_seed(3)) - 4
+    means = torch.stack([at[:, 0], torch.zeros(count), at[:, 1]], dim=1)
+    return splats(means, [math.log(size), math.log(1e-3), math.log(size)], 8.0)
+
+
+def seen_from(*distances: float) -> Views:
+    """Views along y of the origin."""
+    eyes = torch.tensor([[0.0, -distance, 0.0] for distance in distances], dtype=torch.float64)
+    return views_of(look_at(eyes, torch.zeros_like(eyes), UP), 640, 360, UNITS)
+
+
+def sampler_of(scene: Gaussians) -> Sampler:
+    return Sampler(scene, (640, 360), Up(UP))
+
+
+def test_the_likelihood_is_that_of_its_formula():
+    sampler, views = sampler_of(wall()), seen_from(2.0, 3.0)
+    likelihoods, shown = sampler.judged(views)
+    small = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
+    width = 0.06 * UNITS / sampler.content[1]
+    for row, view in enumerate(small):
+        pixels = pixels_of(sampler.few, view).double()
+        away = (sampler.few.means.double() - torch.tensor([0.0, -2.0 - row, 0.0])).norm(dim=1)
+        blur = float((pixels * width / away).sum() / pixels.sum())
+        empty = 1 - float(pixels.sum()) / (view.width * view.height)
+        share = (float((pixels > 0.02).sum()) + 1) / 3000
+        expected = math.log(share / (empty + 0.01) / blur**2) - 0.5 * (15 / 25) ** 2  # they look level
+        assert float(likelihoods[row]) == pytest.approx(expected, abs=1e-4)  # float32
+        assert float(shown[row].sum()) + 1 == pytest.approx(share * 3000)
+
+
+def test_evidence_of_sh_counts_where_there_are_sh():
+    scene, views = ball(500, 1, opacity=5.0), seen_from(12.0, 15.0)
+    without = scene.replace(features_rest=torch.zeros_like(scene.features_rest))
+    traces = PhotoTraces(in_units(scene, *content_size(scene)))
+    added = sampler_of(scene).judged(views)[0] - sampler_of(without).judged(views)[0]
+    torch.testing.assert_close(added, 0.75 * traces.evidence(places_of(views)).double())
+
+
+def test_the_next_view_shows_what_earlier_ones_do_not():
+    shown = torch.zeros(4, 300, dtype=torch.bool)
+    shown[0, :150] = shown[1, :149] = True
+    shown[2, 150:250] = shown[3, 250:] = True
+    likelihoods = torch.tensor([0.0, 0.0, 0.0, -9.0], dtype=torch.float64)
+    found = sampler_of(wall(300)).completing
+    assert found(likelihoods, shown, 4) == found(likelihoods, shown, 9) == [0, 2, 1, 3]
+    assert found(likelihoods, shown, 0) == []
+
+
+@pytest.mark.parametrize("size", [-1e4, -80.0, 80.0, 1e4])
+def test_gaussians_of_any_size_have_views_of_finite_likelihood(size):
+    scene = wall(400)
+    scales = scene.scales.clone()
+    scales[::2] = size
+    sampler = sampler_of(scene.replace(scales=scales))
+    views = sampler.views(5)
+    assert bool(views.viewmats.isfinite().all())
+    assert bool(sampler.judged(views_in_units(views, *sampler.content))[0].isfinite().all())

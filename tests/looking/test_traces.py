@@ -12,26 +12,17 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.looking.traces import PhotoEvidence, PhotoPlaces, correlation, photo_places, trace_factors
+from pointsplat_ns.looking.traces import PhotoTraces, correlation, trace_factors
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
 from pointsplat_ns.views import Views
 
 
-def places_in(scene: Gaussians) -> PhotoPlaces | None:
-    generator = torch.Generator().manual_seed(0)
-    return photo_places(PhotoEvidence.of(scene, generator), generator)
-
-
-def sure_of_photos(scene: Gaussians) -> bool:
-    found = places_in(scene)
-    return found is not None and found.sure
-
-
 def test_places_of_photos_are_found():
-    places, shares, sure = places_in(photographed())
-    assert sure
+    found = PhotoTraces(photographed())
+    places, shares = found.places, found.shares
+    assert found.sure
     away = torch.cdist(places, EYES.double()).min(1).values
     assert float(shares.sum()) == pytest.approx(1) and bool((shares > 0).all())
     assert float((shares * away).sum()) < 1.0
@@ -58,7 +49,7 @@ def test_infinite_sizes_and_gaussians_at_one_position_break_nothing():
         scene.replace(means=torch.zeros(3000, 3)),
         scene.replace(scales=torch.full((3000, 3), -math.inf)),
     ):
-        found = places_in(other)
+        found = PhotoTraces(other)
         assert bool(found.shares.isfinite().all()) and bool(found.places.isfinite().all())
     assert not found.sure
 
@@ -86,14 +77,14 @@ def test_correlation_is_that_of_float64_at_any_size(size):
     ids=["random", "degree 0", "zero", "invisible", "NaN"],
 )
 def test_no_place_is_sure_in_scenes_without_evidence(scene):
-    assert not sure_of_photos(scene)
+    assert not PhotoTraces(scene).sure
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e38])
 def test_photo_places_are_found_from_sh_of_any_length_but_zero(factor):
     scene = photographed()
     large = scene.replace(features_rest=(scene.features_rest.double() * factor).clamp(-3e38, 3e38).float())
-    found = places_in(large)
+    found = PhotoTraces(large)
     assert found.sure == (factor != 1e-30)
     assert bool(found.places.isfinite().all()) and float(found.shares.sum()) == pytest.approx(1)
 
@@ -156,7 +147,7 @@ def test_views_are_sampled_where_photos_were_taken():
     directions = torch.nn.functional.normalize(shell.means - eye, dim=1)
     steps = 0.1 * torch.randn(3000, 3, generator=torch.manual_seed(1))
     scene = shell.replace(features_rest=steps[:, None] * sh_basis(directions, 3)[:, 1:, None])
-    assert sure_of_photos(scene)
+    assert PhotoTraces(scene).sure
     away = []
     for views in (sample_views(scene, 4, 64, 48), sample_views(shell, 4, 64, 48)):
         away.append(float((invert_rigid(views.viewmats)[:, :3, 3] - eye.double()).norm(dim=1).mean()))
@@ -179,7 +170,7 @@ def test_given_views_go_before_a_datasets_and_those_before_sampled_ones(scene, t
     assert source.views(9) is given and len(source.known(2)) == 2 and source.origin == "given views"
     gone = ViewSource(scene, run=run, dataset_views=data_is_gone)
     assert len(gone.views(2)) == 2
-    assert gone.origin == f"sampled poses, up is {gone.up} (no dataset: its data is not there)"
+    assert gone.origin == f"sampled poses, up is {gone.sampler.up} (no dataset: its data is not there)"
     assert ViewSource(scene, run="scene.ply", dataset_views=dataset_views).known(4) is None
     assert ViewSource(scene, given=given[:0]).known(3) is None
     with pytest.raises(DataError, match="the views given are empty"):

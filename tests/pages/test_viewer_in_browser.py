@@ -134,7 +134,7 @@ def test_button_and_key_turn_through_all_axes_and_name_the_one_that_is_up(browse
     guess = Up(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), sure=False)
     for up, first in ((None, "up: +z, a guess"), ("z", "up: +z")):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("pointsplat_ns.looking.sampling.pointing_up", lambda *_: guess)
+            patch.setattr("pointsplat_ns.looking.sampling.upright", lambda *_: guess)
             with ps.open_viewer(ps.example_room()[::20], port=0, up=up) as viewer:
                 browser.get(viewer.url)
                 waited(lambda: still(browser), "a picture")

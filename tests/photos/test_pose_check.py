@@ -92,7 +92,7 @@ def test_half_of_the_views_may_look_elsewhere():
 def test_a_scene_that_shows_nothing_and_no_view_have_no_fault(rows):
     scene = statue()
     assert pose_faults(scene[:rows].replace(opacities=scene.opacities[:rows] * 0 - 30), around(8.0)).text == ""
-    assert pose_faults(scene, around(8.0)[:0]).text == "" and likeness(scene, []).text() == ""
+    assert pose_faults(scene, around(8.0)[:0]).text == "" and likeness(scene, []).text == ""
 
 
 @pytest.mark.parametrize("size", [-200.0, 200.0, math.nan])
@@ -114,7 +114,7 @@ def test_photos_of_other_exposure_opacity_and_size_are_like_their_renders():
     ]
     faint = scene.replace(opacities=scene.opacities - 5.0)
     found = likeness(faint, photos)
-    assert found.text() == "" and found.own > 0.5 and found.count == 5 and found.psnr < 15
+    assert found.text == "" and found.own > 0.5 and found.count == 5 and found.psnr < 15
 
 
 def test_photos_of_views_a_turn_away_are_not_like_their_renders():
@@ -122,8 +122,8 @@ def test_photos_of_views_a_turn_away_are_not_like_their_renders():
     photos = photos_of(scene, views)
     other = [(views[(index + 6) % 12], photo, mask) for index, (_, photo, mask) in enumerate(photos)]
     background = [(view, torch.rand(480, 640, 3, generator=torch.Generator().manual_seed(3)), None) for view in views]
-    assert likeness(scene, photos).text() == ""
-    assert "dB PSNR in 12 photos, correlation" in likeness(scene, background).text()
+    assert likeness(scene, photos).text == ""
+    assert "dB PSNR in 12 photos, correlation" in likeness(scene, background).text
     assert likeness(scene, other).own < likeness(scene, photos).own - 0.3
 
 

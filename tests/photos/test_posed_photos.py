@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import psutil
 import pytest
@@ -18,7 +19,7 @@ from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.photos import frame as module
-from pointsplat_ns.photos.posed_photos import read_posed_photos
+from pointsplat_ns.photos.posed_photos import PosedPhotos, read_with_photos
 from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, write_photos
 
 COUNT = 18
@@ -35,12 +36,8 @@ def few_steps(monkeypatch):
     monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
 
 
-def moved(views: ps.Views, turn: torch.Tensor | None = None, scale: float = 1.0, flipped: bool = False) -> ps.Views:
-    """Cameras in a turned and scaled world; with the camera axes of OpenGL if flipped."""
-    poses = invert_rigid(views.viewmats.double())
-    poses[:, :3] = (torch.eye(3) if turn is None else turn).double() @ poses[:, :3]
-    poses[:, :3, 3] *= scale
-    return replace(views, viewmats=invert_rigid(flip_camera_axes(poses) if flipped else poses))
+def read(scene: ps.Gaussians, folder: Path, poses: Path | None = None, **options) -> PosedPhotos:
+    return read_with_photos(scene, folder, poses, **options)[1]
 
 
 def same_poses(found: ps.Views, views: ps.Views, within: float = 1e-5) -> bool:
@@ -62,7 +59,7 @@ def test_poses_are_found_where_projects_have_them(kind, scene, views, tmp_path, 
     else:
         content = nerfstudio(views) if kind == "transforms.json" else inria(views)
         (tmp_path / kind).write_text(json.dumps(content))
-    found = read_posed_photos(scene, folder, poses if kind == "named" else None)
+    found = read(scene, folder, poses if kind == "named" else None)
     assert same_poses(found.views, views) and "moved into" not in said.text
     assert (len(found.training), len(found.held_out)) == (15, 3)
     # In the order of names as text: frame_0, frame_1, frame_10, ..., of which 0, 16 and 7 come first, ninth and last.
@@ -73,20 +70,25 @@ def test_poses_are_found_where_projects_have_them(kind, scene, views, tmp_path, 
     assert "photos: 18 of " in said.text and "3 are held out; 166 kB in memory" in said.text
 
 
-@pytest.mark.parametrize(
-    ("turn", "scale", "flipped", "text"),
-    [
-        (UP, 1.0, True, "axes x, y, z of the scene are x, z, -y of the poses, camera axes y and z turned around"),
-        (None, 0.4, False, "positions times 2.5"),
-    ],
-    ids=["both", "small"],
-)
-def test_frames_that_a_similarity_mends_are_found_and_named(turn, scale, flipped, text, scene, views, tmp_path, said):
+def test_turned_axes_of_the_world_and_of_cameras_are_found_and_named(scene, views, tmp_path, said):
     folder = write_photos(scene, views, tmp_path / "images")
-    write_colmap_text(moved(views, turn, scale, flipped), tmp_path / "sparse/0")
-    found = read_posed_photos(scene, folder)
-    assert same_poses(found.views, views, 1e-5 if scale == 1 else 2e-3)
-    assert f"poses are moved into the frame of the scene: {text}" in said.text
+    poses = invert_rigid(views.viewmats.double())
+    poses[:, :3] = UP.double() @ poses[:, :3]
+    write_colmap_text(replace(views, viewmats=invert_rigid(flip_camera_axes(poses))), tmp_path / "sparse/0")
+    assert same_poses(read(scene, folder).views, views)
+    assert (
+        "poses are moved into the frame of the scene: axes x, y, z of the scene are x, z, -y of the poses, "
+        "camera axes y and z turned around"
+    ) in said.text
+
+
+def test_another_scale_of_the_poses_is_found_and_named(scene, views, tmp_path, said):
+    folder = write_photos(scene, views, tmp_path / "images")
+    poses = invert_rigid(views.viewmats.double())
+    poses[:, :3, 3] *= 0.4
+    write_colmap_text(replace(views, viewmats=invert_rigid(poses)), tmp_path / "sparse/0")
+    assert same_poses(read(scene, folder).views, views, 2e-3)
+    assert "poses are moved into the frame of the scene: positions times 2.5" in said.text
 
 
 def test_a_scene_in_the_frame_of_nerfstudio_needs_no_file_that_says_so(scene, views, tmp_path, said):
@@ -100,7 +102,7 @@ def test_a_scene_in_the_frame_of_nerfstudio_needs_no_file_that_says_so(scene, vi
     assert oriented[:, :3, 3].mean(0).abs().max() < 1e-9
     folder = write_photos(scene, views, tmp_path / "images")
     (tmp_path / "transforms.json").write_text(json.dumps(nerfstudio(views)))
-    found = read_posed_photos(there, folder)
+    found = read(there, folder)
     assert same_poses(found.views, replace(views, viewmats=invert_rigid(oriented)), 1e-4)
     assert "oriented, centred and scaled as nerfstudio does" in said.text
 
@@ -114,11 +116,11 @@ def test_applied_and_dataparser_transforms_that_a_scene_lacks_are_undone(scene, 
     shifted = module.Motion(torch.tensor(rows, dtype=torch.float64))
     saved = replace(views, viewmats=invert_rigid(shifted.of(invert_rigid(views.viewmats.double()))))
     (tmp_path / "transforms.json").write_text(json.dumps({**nerfstudio(saved), "applied_transform": rows}))
-    assert same_poses(read_posed_photos(scene, folder).views, views)
+    assert same_poses(read(scene, folder).views, views)
     assert "applied_transform undone" in said.text
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": rows, "scale": 0.5}))
     (tmp_path / "transforms.json").write_text(json.dumps(nerfstudio(views)))
-    assert same_poses(read_posed_photos(scene, folder).views, views)
+    assert same_poses(read(scene, folder).views, views)
     assert "without dataparser_transforms.json" in said.text
 
 
@@ -128,7 +130,7 @@ def test_photos_of_another_scene_are_refused_with_their_psnr(scene, views, tmp_p
     folder = write_photos(other.replace(features_dc=colors), views, tmp_path / "images")
     write_colmap_text(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match=r"unlike the photos in the frame .* dB PSNR in 8 photos.*--poses"):
-        read_posed_photos(scene, folder)
+        read(scene, folder)
 
 
 def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, said):
@@ -136,7 +138,7 @@ def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, sa
     for index in (3, 16):
         write_picture(1 - ps.render(scene, views[index]), folder / name_of(index))
     write_colmap_text(views, tmp_path / "sparse/0")
-    found = read_posed_photos(scene, folder)
+    found = read(scene, folder)
     assert (len(found.training), len(found.held_out)) == (14, 2)  # no other photo is held out in its place
     [line] = [line for line in said.messages if "fit worst are left out" in line]
     assert "frame_3.png (" in line and "frame_16.png (" in line and line.count("dB") == 2
@@ -149,15 +151,15 @@ def test_photos_that_cannot_be_read_are_named_and_left_out(scene, views, tmp_pat
     first, other = folder / name_of(0), folder / name_of(5)
     first.write_bytes(first.read_bytes()[:-2000])
     other.write_bytes(b"no photo")
-    found = read_posed_photos(scene, folder)
+    found = read(scene, folder)
     assert (len(found.training), len(found.held_out)) == (14, 2)
     [line] = [line for line in said.messages if line.startswith("photos that cannot be used are left out: ")]
     assert f"{first}: cannot be read as a photo" in line and f"{other}: cannot be read as a photo" in line
-    assert len(read_posed_photos(scene, folder, training=False).held_out) == 2
+    assert len(read(scene, folder, training=False).held_out) == 2
     for path in folder.iterdir():
         path.write_bytes(b"no photo")
     with pytest.raises(DataError, match="cannot be read as a photo"):
-        read_posed_photos(scene, folder)
+        read(scene, folder)
 
 
 def test_names_that_do_not_match_are_told_with_examples_of_both(scene, views, tmp_path):
@@ -166,24 +168,24 @@ def test_names_that_do_not_match_are_told_with_examples_of_both(scene, views, tm
         path.rename(folder / f"IMG_{index}.png")
     write_colmap_text(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match=r"0 of its 18 cameras .*'frame_0.png', 'frame_1.png'; of photos: 'IMG_0.png'"):
-        read_posed_photos(scene, folder)
+        read(scene, folder)
 
 
 def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, monkeypatch):
     folder = write_photos(scene, views[:7], tmp_path / "images")
     with pytest.raises(DataError, match="no poses there, above it or beside the scene"):
-        read_posed_photos(scene, folder)
+        read(scene, folder)
     write_colmap_text(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match="7 of its 18 cameras have a photo in .*; expected at least 8"):
-        read_posed_photos(scene, folder)
+        read(scene, folder)
     with pytest.raises(SceneError, match="no such file"):
-        read_posed_photos(scene, folder, tmp_path / "none.json")
+        read(scene, folder, tmp_path / "none.json")
     write_photos(scene, views, folder)
     free = psutil.virtual_memory()._replace(available=100_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     with pytest.raises(DataError, match="lower --resolution"):
-        read_posed_photos(scene, folder)
-    small = read_posed_photos(scene, folder, resolution=(32, 24))
+        read(scene, folder)
+    small = read(scene, folder, resolution=(32, 24))
     assert small.training[0].target.shape == (24, 32, 3) and (small.views.width, small.views.height) == (32, 24)
 
 
@@ -200,7 +202,7 @@ def test_a_scene_that_gsplat_normalised_is_found_by_the_models_points(scene, vie
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
     scale = float((there[0, :3, 3] - there[1, :3, 3]).norm() / (poses[0, :3, 3] - poses[1, :3, 3]).norm())
     offset = there[0, :3, 3] - scale * matrix @ poses[0, :3, 3]
-    found = read_posed_photos(Similarity(half_turn @ matrix, scale, half_turn @ offset).apply(scene), folder)
+    found = read(Similarity(half_turn @ matrix, scale, half_turn @ offset).apply(scene), folder)
     turned = module._turned(there, half_turn)
     assert same_poses(found.views, replace(views, viewmats=invert_rigid(turned)), 1e-4)
     assert "normalised as gsplat does, axes x, y, z of the scene are -x, -y, z of the poses" in said.text
@@ -214,7 +216,7 @@ def test_a_white_background_is_found(views, tmp_path, said):
     white = replace(around, background=torch.ones(3))
     folder = write_photos(thing, white, tmp_path / "images")
     write_colmap_text(around, tmp_path / "sparse/0")
-    found = read_posed_photos(thing, folder)
+    found = read(thing, folder)
     assert found.views.background.tolist() == found.training[0].view.background.tolist() == [1.0] * 3
     assert "white background" in said.text
 

@@ -11,14 +11,13 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import SHARED_DATA, cloud, run_of, views_from_within
+from making import cloud, run_of, views_from_within
 from pointsplat_ns.cli import main
 from pointsplat_ns.errors import PointSplatError, SceneError
-from pointsplat_ns.geometry.transforms import invert_rigid
+from pointsplat_ns.geometry.transforms import direction_of, invert_rigid
 from pointsplat_ns.io.camera_files import read_named_views
 from pointsplat_ns.io.turning import Similarity
-from pointsplat_ns.looking.upright import axis_named
-from pointsplat_ns.photos.posed_scene import PosesFile, read_posed
+from pointsplat_ns.photos.posed_scene import PosesFile, read_found
 from pointsplat_ns.placing import run_frame
 from posing import inria, nerfstudio, write_colmap_text, write_photos, written
 
@@ -55,11 +54,14 @@ def test_the_transforms_beside_scene_or_poses_are_applied(beside, scene, views, 
     content, transforms = in_dataset(views, tmp_path)
     path = written(content, tmp_path / "poses" / "transforms.json")
     with pytest.raises(ps.DataError, match=r"0 of 6 cameras see anything of the scene.*dataparser_transforms.json"):
-        read_posed(tmp_path / "scene" / "room.ply", path)
+        read_found(tmp_path / "scene" / "room.ply", path)
     written(transforms, tmp_path / beside / "dataparser_transforms.json")
-    dense, found = read_posed(tmp_path / "scene" / "room.ply", path)
+    dense, found, _ = read_found(tmp_path / "scene" / "room.ply", path)
     assert len(dense) == len(scene)
     torch.testing.assert_close(found.viewmats.float(), views.viewmats.float(), rtol=0, atol=1e-3)  # of 1000 units
+    ps.save(scene.replace(means=scene.means + 1000), tmp_path / "scene" / "room.ply", overwrite=True)
+    with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
+        read_found(tmp_path / "scene" / "room.ply", path)
 
 
 def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls, tmp_path):
@@ -73,7 +75,7 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
     original = nerfstudio(replace(known, viewmats=invert_rigid(back @ poses)))
     path = written(original, tmp_path / "transforms.json")
     for named in (run, run / "config.yml", next((run / "nerfstudio_models").glob("*.ckpt"))):
-        dense, found = read_posed(named, path)
+        dense, found, _ = read_found(named, path)
         assert dense.antialiased
         torch.testing.assert_close(found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5)
 
@@ -108,15 +110,15 @@ def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, v
         (tmp_path / "dslr" / "nerfstudio").mkdir(exist_ok=True)
         return written(content, tmp_path / "dslr" / "nerfstudio" / "transforms.json")
 
-    _, found = read_posed(scene, poses_of(views))
+    _, found, _ = read_found(scene, poses_of(views))
     assert len(found) == len(views)
     with pytest.raises(
         ps.DataError, match=r"no more like the photos of their views than like others \(.* dB PSNR in 6"
     ):
-        read_posed(scene, poses_of(turned_about(views)))
+        read_found(scene, poses_of(turned_about(views)))
     for photo in photos.iterdir():
         photo.write_bytes(b"no photo")
-    read_posed(scene, poses_of(turned_about(views)))  # nothing to compare with
+    read_found(scene, poses_of(turned_about(views)))  # nothing to compare with
 
 
 def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_path):
@@ -127,24 +129,6 @@ def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_pat
         frame["file_path"] = f"../{frame['file_path']}"
     found = read_named_views(written(content, tmp_path / "in" / "transforms.json"))
     assert [found.photo(index) for index in range(6)] == [None] * 6
-
-
-FOX_RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
-FOX_POSES = SHARED_DATA / "scannetpp" / "fox" / "dslr" / "nerfstudio" / "transforms.json"
-
-
-@pytest.mark.skipif(not (FOX_RUN.exists() and FOX_POSES.exists()), reason="no real run at hand")
-def test_an_export_of_nerfstudio_needs_the_transforms_of_its_run(tmp_path):
-    ps.save(ps.load(FOX_RUN), tmp_path / "fox.ply")
-    alone = shutil.copy(FOX_POSES, tmp_path / "transforms.json")  # without its photos
-    for poses in (alone, FOX_POSES):
-        with pytest.raises(ps.DataError, match=r"transforms.json: .*put that file beside the scene.*--original-frame"):
-            read_posed(tmp_path / "fox.ply", poses)
-    shutil.copy(FOX_RUN / "dataparser_transforms.json", tmp_path)
-    for poses in (alone, FOX_POSES):
-        assert len(read_posed(tmp_path / "fox.ply", poses)[1]) == 45
-    with pytest.raises(ps.DataError, match="dataparser_transforms.json is of another run"):
-        read_posed(ps.load(FOX_RUN).replace(means=ps.load(FOX_RUN).means + 30.0), alone)
 
 
 SEED = 4
@@ -177,7 +161,7 @@ def test_up_is_turned_to_where_it_is_wanted():
     scene = cloud(20, SEED)
     for start, end in (("z", "y"), ("-y", "z"), ("x", "-x"), ("z", "z")):
         turned = ps.place(scene, up=f"{start}:{end}")
-        now, wanted = (axis_named(text) for text in (start, end))
+        now, wanted = (direction_of(text) for text in (start, end))
         assert torch.allclose(scene.means.double() @ now, turned.means.double() @ wanted, atol=1e-6)
 
 
