@@ -40,16 +40,16 @@ def stopped_at(
     step: int, config, run_training, monkeypatch, number: int, times: int = 1, trainer_class=SplatfactoCpuTrainer
 ) -> int:
     """The status with which a training ends that gets a signal in the middle of a step."""
-    iteration = trainer_class.train_iteration
+    update = trainer_class.update
 
-    def signalled(trainer, now):
+    def signalled(trainer, now, skipped):
         if now == step:
             for _ in range(times):
                 os.kill(os.getpid(), number)
-        return iteration(trainer, now)
+        update(trainer, now, skipped)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(trainer_class, "train_iteration", signalled)
+        patch.setattr(trainer_class, "update", signalled)
         run_training(config)
     return end.value.code
 
@@ -98,14 +98,9 @@ def test_a_second_or_early_signal_ends_it_at_once_and_saves_nothing(
     assert stopped_at(3, config, run_training, monkeypatch, signal.SIGINT, times=2) == 130
     assert not list(config.get_checkpoint_dir().glob("*"))
     early = wall_config(wall_scene, tmp_path / "early", steps=30)
-    stop = SplatfactoCpuTrainer._stop_if_asked
-
-    def asked(trainer, step):
-        trainer._asked = signal.SIGINT
-        stop(trainer, step)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(SplatfactoCpuTrainer, "_stop_if_asked", asked)
+        patch.setattr(SplatfactoCpuTrainer, "_asked", signal.SIGINT)
         run_training(early)
     assert end.value.code == 130 and not early.get_checkpoint_dir().exists()
 
