@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import sys
-from pathlib import Path
 
 
 def keep_freed_memory() -> bool:
@@ -43,33 +42,3 @@ def _set(values: dict[int, int]) -> bool:
     except (OSError, AttributeError):
         return False  # another C library
     return all(bool(mallopt(name, value)) for name, value in values.items())
-
-
-class PeakMemory:
-    """The most memory that this process holds from here on, as Linux counts it (resident, freed memory given back
-    first).
-
-    Example:
-        >>> peak = PeakMemory()
-        >>> filled = bytearray(10**8)
-        >>> peak.bytes() is None or peak.bytes() >= 10**8
-        True
-    """
-
-    def __init__(self) -> None:
-        self._known = False
-        give_back_freed_memory()
-        try:
-            Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark to what is resident now
-            self._known = True
-        except (OSError, AttributeError, TypeError):
-            pass  # another system
-
-    def bytes(self) -> int | None:
-        """The peak so far; None where it cannot be known."""
-        if not self._known:
-            return None
-        for line in Path("/proc/self/status").read_text("utf-8").splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-        return None

@@ -12,8 +12,8 @@ import pytest
 from browser import chromium, complaints
 from html_parts import names_nothing_outside, parts_of
 from pointsplat_ns.pages.pictures import picture_uri
-from pointsplat_ns.tradeoff.page import write_page
 from pointsplat_ns.tradeoff.points import ImageMetrics, Tradeoff
+from pointsplat_ns.tradeoff.table import write_page
 from trades import POINTS
 
 HOSTILE = "<script>document.title='run'</script><img src=x onerror=\"document.title='run'\">\"'&</title>"
