@@ -99,8 +99,9 @@ def wrongness(frame: Frame, outputs: DataparserOutputs) -> float:
 
 def test_every_pixel_shows_what_its_camera_sees(trained):
     manager = trained.trainer.pipeline.datamanager
-    frames = [*manager.train_frames, *manager.eval_frames]
-    assert len(manager.eval_frames) > 0 and len(frames) == trained.layout.frames
+    held_out = manager.fixed_indices_eval_dataloader
+    frames = [*manager.train_frames, *held_out]
+    assert len(held_out) > 0 and len(frames) == trained.layout.frames
     assert all(wrongness(frame, trained.outputs) < trained.layout.wrong for frame in frames)
     camera, data = frames[0]
     camera.cx = camera.cx + 0.5

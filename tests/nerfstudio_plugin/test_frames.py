@@ -14,8 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.nerfstudio_plugin.frames import Frames
-from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.frames import Frames, UndistortedDataset
 
 WIDTH, HEIGHT = 40, 30
 

@@ -16,11 +16,11 @@ from pointsplat_ns.nerfstudio_plugin.cameras import carried
 from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
 from pointsplat_ns.nerfstudio_plugin.pointsplat import dense_scenes
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D, Views
 
-POSES = SampledPoses(train=6, test=3, width=32, height=24, seed=1)
+POSES = ScenesDataManagerConfig(sampled_poses=6, sampled_size=(32, 24), seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_what_holds_no_scene_says_so(rooms, tmp_path):
 def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):
     monkeypatch.setattr(dense_scenes, "sample_views", sample_views)  # anew for each
     first, second = scene_of(rooms), scene_of(rooms)
-    assert len(first.train_frames) == 6 and len(first.eval_frames) == 3
+    assert len(first.train_frames) == 6 and len(first.eval_frames) == 1
     for split in ("train", "test"):
         assert torch.equal(first.cameras(split).camera_to_worlds, second.cameras(split).camera_to_worlds)
     train, held_out = (first.cameras(split).camera_to_worlds.reshape(-1, 12) for split in ("train", "test"))
@@ -96,4 +96,4 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
         scene.rendered_train[6]
     # Every second training picture is subsampled from one of the size that people look at.
     assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
-    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_eval] == 3 * [EPS2D]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_eval] == [EPS2D]

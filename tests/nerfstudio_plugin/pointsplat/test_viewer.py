@@ -1,7 +1,5 @@
 """What nerfstudio's viewer and the exporters get of the model."""
 
-from unittest import mock
-
 import torch
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -26,7 +24,6 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     assert torch.equal(model.shs_0, model.gauss_params["features_dc"])
     assert model.colors.shape == (model.num_points, 3)
     assert len(evaluated.datamanager.train_dataset) == 9 and len(evaluated.datamanager.eval_dataset) == 2
-    assert model.get_outputs(mock.Mock(spec=[])) == {}
     half = OrientedBox.from_params((-50.0, 0.0, 0.0), (0.0, 0.0, 0.0), (100.0, 100.0, 100.0))
     inside = model.gaussians[model.gaussians.means[:, 0] < 0]
     expected = model.draw(inside, evaluated.datamanager.scenes[1], camera)
