@@ -41,7 +41,6 @@ def test_a_specification_that_fails_to_load_becomes_one_line():
 
     line = load_specification("some-method", broken)
     assert line == "some-method of pointsplat-ns, which failed to load (ImportError: no module named 'x')"
-    assert load_specification("some-method", dict) == {}
 
 
 def test_an_input_error_ends_a_command_with_one_line_and_status_1():
