@@ -41,12 +41,10 @@ def as_colmap(capture: Capture, folder: Path) -> Path:
     return folder
 
 
-def nerfstudio_data() -> NerfstudioDataParserConfig:
-    return NerfstudioDataParserConfig(load_3D_points=True)
-
-
 LAYOUTS = {
-    "nerfstudio-data": Layout(Lens(), Capture.write_nerfstudio, nerfstudio_data),
+    "nerfstudio-data": Layout(
+        Lens(), Capture.write_nerfstudio, lambda: NerfstudioDataParserConfig(load_3D_points=True)
+    ),
     "colmap": Layout(Lens(distortion=(0.12, -0.05, 0.004, -0.003)), as_colmap, ColmapDataParserConfig),
     "scannetpp-seeded": Layout(
         FISHEYE, Capture.write_scannetpp, SeededScanNetppDataParserConfig, frames=FRAMES - len(BAD)
@@ -54,24 +52,13 @@ LAYOUTS = {
 }
 
 
-@dataclass
-class Opened:
-    capture: Capture
-    layout: Layout
-    pipeline: Pipeline
-
-    @property
-    def outputs(self) -> DataparserOutputs:
-        return self.pipeline.datamanager.train_dataparser_outputs
-
-
 @pytest.fixture(scope="module", params=LAYOUTS)
-def opened(request, wall_config, tmp_path_factory) -> Opened:
+def opened(request, wall_config, tmp_path_factory) -> tuple[Capture, Layout, Pipeline]:
     layout = LAYOUTS[request.param]
     capture, folder = Capture(layout.lens), tmp_path_factory.mktemp("capture")
     config = wall_config(layout.write(capture, folder / "data"), folder / "outputs", 1)
     config.pipeline.datamanager.dataparser = layout.dataparser()
-    return Opened(capture, layout, config.pipeline.setup(device="cpu", test_mode="val"))
+    return capture, layout, config.pipeline.setup(device="cpu", test_mode="val")
 
 
 def wrongness(frame: Frame, outputs: DataparserOutputs) -> float:
@@ -91,25 +78,26 @@ def wrongness(frame: Frame, outputs: DataparserOutputs) -> float:
 
 
 def test_every_pixel_shows_what_its_camera_sees(opened):
-    manager = opened.pipeline.datamanager
+    _, layout, pipeline = opened
+    manager, outputs = pipeline.datamanager, pipeline.datamanager.train_dataparser_outputs
     held_out = manager.fixed_indices_eval_dataloader
     frames = [*manager.train_frames, *held_out]
-    assert len(held_out) > 0 and len(frames) == opened.layout.frames
-    assert all(wrongness(frame, opened.outputs) < opened.layout.wrong for frame in frames)
+    assert len(held_out) > 0 and len(frames) == layout.frames
+    assert all(wrongness(frame, outputs) < layout.wrong for frame in frames)
     camera, data = frames[0]
     camera.cx = camera.cx + 0.5
-    assert wrongness((camera, data), opened.outputs) > opened.layout.wrong, "half a pixel would not be noticed"
+    assert wrongness((camera, data), outputs) > layout.wrong, "half a pixel would not be noticed"
 
 
 def test_a_scene_starts_from_the_points_of_the_capture(opened):
-    outputs = opened.outputs
-    transform = outputs.dataparser_transform.double()
-    points = torch.from_numpy(opened.capture.seeds)
+    capture, _, pipeline = opened
+    outputs = pipeline.datamanager.train_dataparser_outputs
+    transform, points = outputs.dataparser_transform.double(), torch.from_numpy(capture.seeds)
     placed = (points @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
     # 1e-5: float32
     torch.testing.assert_close(outputs.metadata["points3D_xyz"].double(), placed, atol=1e-5, rtol=0)
-    assert np.array_equal(outputs.metadata["points3D_rgb"].numpy(), opened.capture.seed_colors)
-    assert opened.pipeline.model.num_points == SEEDS
+    assert np.array_equal(outputs.metadata["points3D_rgb"].numpy(), capture.seed_colors)
+    assert pipeline.model.num_points == SEEDS
 
 
 TRANSFORMS = "dslr/nerfstudio/transforms.json"

@@ -31,8 +31,8 @@ def moved(wall_scene, tmp_path) -> Path:
     return tmp_path / "moved"
 
 
-def keep_data_of(runs: Path, name: str, trained_walls: Path) -> None:
-    shutil.copy(run_of(trained_walls, name) / "config.yml", run_of(runs, name) / "config.yml")
+def keep_data_of_a(runs: Path, trained_walls: Path) -> None:
+    shutil.copy(run_of(trained_walls, "wall-a") / "config.yml", run_of(runs, "wall-a") / "config.yml")
 
 
 def test_the_data_is_found_at_or_below_the_folder_that_is_named(runs, moved, trained_walls):
@@ -75,7 +75,7 @@ def test_data_is_not_for_a_scene_without_a_run(moved, tmp_path):
 
 
 def test_a_run_without_its_data_does_not_stop_a_folder_and_is_named(runs, moved, trained_walls, tmp_path):
-    keep_data_of(runs, "wall-a", trained_walls)
+    keep_data_of_a(runs, trained_walls)
     results = ps.compact_folder(runs, tmp_path / "out", "50%", effort="instant")
     assert [result.status for result in results] == ["done", "done"]
     assert results[0].note == "" and results[1].note.startswith("no dataset: ") and "gone_from_here" in results[1].note
@@ -93,7 +93,7 @@ def test_a_training_leaves_out_a_run_without_its_photos_and_names_it(runs, moved
     with pytest.raises(SceneError, match="gone_from_here.*that of 1 more runs; .*scene-data DIR.*supervision dense"):
         manager_of()
     assert [scene.name for scene in manager_of(scene_data=moved).scenes] == ["wall-a", "wall-b"]
-    keep_data_of(runs, "wall-a", trained_walls)
+    keep_data_of_a(runs, trained_walls)
     capfd.readouterr()
     assert [scene.name for scene in manager_of().scenes] == ["wall-a"]
     assert "wall-b is left out" in capfd.readouterr().out.replace("\n", " ")
@@ -126,26 +126,22 @@ def with_state(trained_walls: Path, folder: Path, mode: str | None = None, **sta
     return run
 
 
-def adjustments(count: int = NUM_TRAIN) -> torch.Tensor:
-    """Motions of up to about a unit and a radian; one so small that exponentials are near their limit, and none."""
-    values = 0.5 * torch.randn(count, 6, generator=torch.Generator().manual_seed(SEED))
-    values[0], values[1] = 0.0, 1e-6 * values[1]
-    return values
+ADJUSTMENTS = 0.5 * torch.randn(NUM_TRAIN, 6, generator=torch.Generator().manual_seed(SEED))
+"""Motions of up to about a unit and a radian; none, and one so small that exponentials are near their limit."""
+ADJUSTMENTS[0], ADJUSTMENTS[1] = 0.0, 1e-6 * ADJUSTMENTS[1]
 
 
 @pytest.mark.parametrize(("mode", "key"), [("SO3xR3", "_model"), ("SE3", "_model.module")])
 def test_training_poses_are_corrected_as_by_nerfstudios_model(mode, key, trained_walls, tmp_path):
-    run = with_state(trained_walls, tmp_path, mode, **{f"{key}.camera_optimizer.pose_adjustment": adjustments()})
+    run = with_state(trained_walls, tmp_path, mode, **{f"{key}.camera_optimizer.pose_adjustment": ADJUSTMENTS})
     plain = ScenesDataManagerConfig(data=run_of(trained_walls, "wall-b")).setup(test_mode="val").training_frames(0)
     optimizer = CameraOptimizerConfig(mode=mode).setup(num_cameras=NUM_TRAIN, device="cpu")
-    optimizer.pose_adjustment.data = adjustments()
-    expected = []
-    for index in range(NUM_TRAIN):
-        camera, _ = plain[index]
+    optimizer.pose_adjustment.data = ADJUSTMENTS
+    cameras = [camera for camera, _ in plain]
+    for index, camera in enumerate(cameras):
         camera.metadata = {"cam_idx": index}
-        expected.append(optimizer.apply_to_camera(camera).detach())
-    expected = torch.cat(expected)
-    before = torch.cat([plain[index][0].camera_to_worlds for index in range(NUM_TRAIN)])
+    expected = torch.cat([optimizer.apply_to_camera(camera).detach() for camera in cameras])
+    before = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert float((expected - before).abs().max()) > 0.3 and torch.equal(expected[0], before[0])
 
     held_out = (ps.dataset_views(path, "test").viewmats for path in (run_of(trained_walls, "wall-b"), run))
@@ -156,24 +152,22 @@ def test_training_poses_are_corrected_as_by_nerfstudios_model(mode, key, trained
     assert torch.allclose(torch.stack([photo.view.viewmat for photo in photos]), views, atol=1e-6)
     for supervision in ("photos", "dense"):
         frames = ScenesDataManagerConfig(data=run, supervision=supervision).setup(test_mode="val").training_frames(0)
-        assert torch.allclose(torch.cat([frames[i][0].camera_to_worlds for i in range(NUM_TRAIN)]), expected, atol=1e-6)
+        assert torch.allclose(torch.cat([camera.camera_to_worlds for camera, _ in frames]), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("values", "mode", "error", "text"),
     [
-        (adjustments(8), "SE3", DataError, "9 training photos, but .* corrects the poses of 8; put back the data"),
-        (adjustments(), None, SceneError, "config.yml: .*mode 'off'.*expected SO3xR3 or SE3"),
-        (adjustments() / 0, "SE3", SceneError, "expected six finite numbers"),
-        (adjustments()[:, :5], "SE3", SceneError, r"shape \(9, 5\); expected six"),
-        (adjustments().long(), "SE3", SceneError, "expected a dense floating-point tensor"),
+        (ADJUSTMENTS[:8], "SE3", DataError, "9 training photos, but .* corrects the poses of 8; put back the data"),
+        (ADJUSTMENTS, None, SceneError, "config.yml: .*mode 'off'.*expected SO3xR3 or SE3"),
+        (ADJUSTMENTS / 0, "SE3", SceneError, "expected six finite numbers"),
+        (ADJUSTMENTS[:, :5], "SE3", SceneError, r"shape \(9, 5\); expected six"),
     ],
 )
 def test_corrections_that_do_not_fit_are_refused(values, mode, error, text, trained_walls, tmp_path):
     run = with_state(trained_walls, tmp_path, mode, **{"_model.camera_optimizer.pose_adjustment": values})
-    with pytest.raises(error, match=text) as caught:
+    with pytest.raises(error, match=text):
         ps.dataset_views(run)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("key", ["_model.bil_grids.grids", "_model.appearance_embeds.weight"])

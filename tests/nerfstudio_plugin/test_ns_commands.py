@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import types
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +75,7 @@ def with_the_viewer_open(method: str, capture: Capture, output: Path, words: lis
         patch.setattr(Viewer, "training_complete", interrupted)
         before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background of a shell it is ignored
         try:
-            started(train, *words, *options, "--max-num-iterations", STEPS[method], *data)
+            started(train, method, *words, *options, "--max-num-iterations", STEPS[method], *data)
         finally:
             signal.signal(signal.SIGINT, before)
     (folder,) = (output / "room" / method).iterdir()
@@ -89,32 +88,22 @@ def capture() -> Capture:
 
 
 @pytest.fixture(scope="module")
-def trained_by_ns_train(capture, tmp_path_factory) -> Callable[[str], Run]:
+def runs(capture, tmp_path_factory) -> dict[str, Run]:
     folder = tmp_path_factory.mktemp("commands")
     capture.write_nerfstudio(folder / "capture")
-    runs: dict[str, Run] = {}
-
-    def trained(method: str) -> Run:
-        if method not in runs:
-            words = [method, "--output-dir", folder / method, "--experiment-name", "room"]
-            words += ["--machine.device-type", "cpu", "--logging.steps-per-log", "1"]
-            data: list[str] = []
-            if method == "splatfacto-cpu":
-                words += ["--data", folder / "capture", "--pipeline.model.num-downscales", "0"]
-                data = ["nerfstudio-data", "--load-3D-points", "True", "--train-split-fraction", "0.8"]
-            else:
-                words += ["--data", trained("splatfacto-cpu").folder, "--pipeline.model.size", "tiny"]
-                words += ["--pipeline.model.by", "paper", "--pipeline.model.lpips-weight", "0"]
-                words += ["--pipeline.model.keep", "0.5"]
-            runs[method] = with_the_viewer_open(method, capture, folder / method, words, data)
-        return runs[method]
-
-    return trained
+    usual = ["--output-dir", folder, "--experiment-name", "room", "--machine.device-type", "cpu"]
+    usual += ["--logging.steps-per-log", "1", "--data"]
+    data = ["nerfstudio-data", "--load-3D-points", "True", "--train-split-fraction", "0.8"]
+    words = [*usual, folder / "capture", "--pipeline.model.num-downscales", "0"]
+    scene = with_the_viewer_open("splatfacto-cpu", capture, folder, words, data)
+    words = [*usual, scene.folder, "--pipeline.model.size", "tiny", "--pipeline.model.by", "paper"]
+    words += ["--pipeline.model.lpips-weight", "0", "--pipeline.model.keep", "0.5"]
+    return {run.method: run for run in (scene, with_the_viewer_open("pointsplat", capture, folder, words, []))}
 
 
 @pytest.fixture(params=STEPS)
-def run(request, trained_by_ns_train) -> Run:
-    return trained_by_ns_train(request.param)
+def run(request, runs) -> Run:
+    return runs[request.param]
 
 
 def test_training_serves_what_the_model_draws_and_logs_every_loss(run: Run):
@@ -127,14 +116,13 @@ def test_training_serves_what_the_model_draws_and_logs_every_loss(run: Run):
 
 def test_viewer_serves_its_page_and_what_the_model_draws_until_ctrl_c(run: Run, capture: Capture):
     viewers: list[Viewer] = []
-    seen: list[Look] = []
 
     def opened(*args, **options) -> Viewer:
         viewers.append(Viewer(*args, **options))
         return viewers[-1]
 
     def between_looks(_: float) -> None:
-        seen.append(look(viewers[0], capture.poses[0]))
+        look(viewers[0], capture.poses[0]).check()
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
@@ -146,7 +134,6 @@ def test_viewer_serves_its_page_and_what_the_model_draws_until_ctrl_c(run: Run, 
         finally:
             for viewer in viewers:
                 viewer.viser_server.stop()
-    seen[0].check()
 
 
 def test_eval_writes_numbers_and_pictures_of_the_held_out_photo(run: Run, no_lpips, tmp_path):
@@ -200,8 +187,8 @@ def test_interpolate_draws_between_the_photos(run: Run, tmp_path):
     assert np.abs(pictures[0] - pictures[6]).mean() > 0.02
 
 
-def test_dataset_puts_the_undistorted_photo_beside_each_render(trained_by_ns_train, tmp_path):
-    run = trained_by_ns_train("splatfacto-cpu")
+def test_dataset_puts_the_undistorted_photo_beside_each_render(runs, tmp_path):
+    run = runs["splatfacto-cpu"]
     words = ["--load-config", run.config, "--output-path", tmp_path, "--image-format", "png"]
     started(render, "dataset", *words, "--split", "train+test", "--rendered-output-names", "rgb", "gt-rgb", "depth")
     _, pipeline, _, _ = eval_setup(run.config, test_mode="test")

@@ -169,21 +169,6 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     assert same_bits(ps.load(written), made.scene) and written.stat().st_size == ply_bytes(setting.count, 1)
 
 
-def test_scenes_are_judged_in_the_views_that_compact_compares_in(room, tmp_path, monkeypatch):
-    resolution = "96x54"
-    monkeypatch.setattr(view_source, "VIEW_COUNTS", replace(view_source.VIEW_COUNTS, compared=3))
-    wanted = ps.compact(room, 0.5, by="opacity", effort="instant", resolution=resolution).views
-    judged, original = [], measuring.views_to_judge
-
-    def watched(*args):
-        judged.append(original(*args)[0].views)
-        return original(*args)
-
-    monkeypatch.setattr(measuring, "views_to_judge", watched)
-    ps.measure_tradeoff(room, tmp_path, keep=["50%"], by=["opacity"], repairs=["none"], resolution=resolution)
-    assert judged[0].viewmats.equal(wanted.viewmats) and judged[0].Ks.equal(wanted.Ks)
-
-
 @pytest.mark.parametrize(("loss", "key"), [(0, "dense"), (0.1, "half"), (0.49, "half"), (0.5, "third"), (3, "tenth")])
 def test_the_fastest_that_is_good_enough(loss, key):
     assert fastest_within(POINTS, loss).key == key  # 30.1 - 29.6 is a little more than 0.5

@@ -40,11 +40,6 @@ def config_of(data: Path, output_dir: Path, steps: int):
     return config
 
 
-def write_rooms(folder: Path) -> None:
-    for seed, name in enumerate("abc"):
-        write_ply(box_room(seed, 600, smooth=True), folder / f"{name}.ply")
-
-
 def train(config, judged: bool = False) -> dict:
     """Losses, gradients of the last update, weights and, if asked for, the evaluation of a training, which is set up as
     by ``ns-train``."""
@@ -79,14 +74,6 @@ def saving(data: Path, output_dir: Path, steps: int):
     return config
 
 
-def resumed(rooms: Path, folder: Path, name: str, rank: int) -> list[dict]:
-    """A training of two processes, and the end of it once more from a checkpoint."""
-    whole = train(saving(rooms, folder / f"{name}{rank}", 4))
-    rest = saving(rooms, folder / f"{name} on {rank}", 1)
-    rest.load_dir, rest.load_step = folder / f"{name}0" / "refiner" / "pointsplat" / "now" / "nerfstudio_models", 2
-    return [whole, train(rest)]
-
-
 @contextmanager
 def two_scenes_a_step() -> Iterator[None]:
     """Within, a step of one process takes the scenes of the two processes, and the mean of their losses."""
@@ -107,7 +94,10 @@ def work(rank: int, folder: Path, port: str) -> None:
     os.environ.update(place, LOCAL_RANK=str(rank), TORCHELASTIC_RUN_ID="as torchrun does")
     found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), judged=True)
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
-        found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank)
+        whole = train(saving(folder / "rooms", folder / f"skipping{rank}", 4))
+        rest = saving(folder / "rooms", folder / f"rest{rank}", 1)
+        rest.load_dir, rest.load_step = folder / "skipping0/refiner/pointsplat/now/nerfstudio_models", 2
+        found["skipping"] = [whole, train(rest)]
     torch.save(found, folder / f"found{rank}.pt")
 
 
@@ -116,7 +106,8 @@ def together(tmp_path_factory):
     """What the two processes found, and what one process finds with two scenes an update."""
     folder = tmp_path_factory.mktemp("parallel")
     (folder / "rooms").mkdir()
-    write_rooms(folder / "rooms")
+    for seed, name in enumerate("abc"):
+        write_ply(box_room(seed, 600, smooth=True), folder / "rooms" / f"{name}.ply")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = str(server.getsockname()[1])
     pair = subprocess.Popen(

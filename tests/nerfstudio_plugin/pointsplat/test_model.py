@@ -12,10 +12,13 @@ import pytest
 import torch
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.scripts.exporter import ExportGaussianSplat
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: lets torch load Splatfacto's checkpoints)
 from making import SHARED_DATA, pipeline_of, same, small_config
+from pointsplat_ns.cli.export import export
 from pointsplat_ns.errors import PointSplatError, SceneError
+from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io import read_ply
 from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
@@ -39,16 +42,11 @@ def test_untrained_the_refined_scene_is_the_pruned_one_to_the_bit(trained_walls)
 
 def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
     pipeline = pipeline_of(trained_walls)
-    modes = []
-
-    def recorded(**arguments):
-        modes.append((arguments["rasterize_mode"], arguments["sh_degree"]))
-        return rasterization(**arguments)
-
     place = "pointsplat_ns.nerfstudio_plugin.cameras.rasterization"
-    with mock.patch(place, recorded), torch.no_grad():
+    with mock.patch(place, side_effect=rasterization) as drawn, torch.no_grad():
         for index in (0, 1):
             pipeline.model.losses(index, [pipeline.datamanager.scenes[index].eval_frames[0]])
+    modes = [(call.kwargs["rasterize_mode"], call.kwargs["sh_degree"]) for call in drawn.call_args_list]
     assert modes == [("classic", 3), ("antialiased", 1)]
 
 
@@ -95,12 +93,9 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
         ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),
         ({"schedule": "step", "drop_at": 0.0}, "--drop-at 0"),
-        ({"global_norm": 0.0}, "--global-norm 0"),
         ({"global_norm": math.nan}, "--global-norm nan"),
-        ({"rate_factor": -1.0}, "--rate-factor"),
         ({"rate_factor": math.inf}, "--rate-factor"),
         ({"seconds": 0.0}, "--seconds 0: expected a finite number above 0"),
-        ({"seconds": math.nan}, "--seconds nan: expected a finite number above 0"),
     ],
 )
 def test_contradictory_settings_are_refused(trained_walls, tmp_path, changes, message):
@@ -207,8 +202,7 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     assert sizes == {"rgb": (48, 64, 3), "depth": (48, 64, 1), "accumulation": (48, 64, 1), "background": (48, 64, 3)}
     assert all(value.isfinite().all() and not value.requires_grad for value in outputs.values())
     assert outputs["accumulation"].max() > 0.5
-    names = {"means", "scales", "quats", "features_dc", "features_rest", "opacities"}
-    assert set(model.gauss_params) == names and model.num_points == len(model.pruned_scene(1).pruned)
+    assert set(model.gauss_params) == set(PARAMETERS) and model.num_points == len(model.pruned_scene(1).pruned)
     assert torch.equal(model.shs_rest, model.gauss_params["features_rest"])
     assert torch.equal(model.shs_0, model.gauss_params["features_dc"])
     assert model.colors.shape == (model.num_points, 3)
@@ -218,17 +212,12 @@ def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_
     expected = model.draw(inside, evaluated.datamanager.scenes[1], camera)
     torch.testing.assert_close(model.get_outputs_for_camera(camera, obb_box=half)["rgb"], expected["rgb"])
     far = OrientedBox.from_params((900.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    empty = model.get_outputs_for_camera(camera, obb_box=far)
-    assert torch.equal(empty["rgb"], torch.ones(48, 64, 3)), "wall-b was trained over white"
+    assert model.get_outputs_for_camera(camera, obb_box=far)["rgb"].eq(1).all(), "wall-b was trained over white"
     assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"]), "the crop box does not stay"
 
 
 def test_both_exporters_write_the_refined_scene_with_the_photos_gone(trained, trained_walls, wall_scene, tmp_path):
-    from nerfstudio.scripts.exporter import ExportGaussianSplat
-
-    from pointsplat_ns.cli.export import export
-
-    config, trainer, _ = trained
+    config, trainer = trained
     expected = trainer.pipeline.eval().model.gaussians
     photos, hidden = wall_scene, wall_scene.with_name("hidden")
     photos.rename(hidden)

@@ -31,15 +31,14 @@ def manager_of(folder: Path, **settings):
     return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(test_mode="val")
 
 
-def make_run(folder: Path, wall_config, scene: Path, change=lambda config: None) -> Path:
-    """A run folder as nerfstudio lays it out, with an empty checkpoint; ``change`` edits the config first."""
-    config = wall_config(scene, folder, steps=1)
-    change(config)
+@pytest.fixture
+def run(tmp_path, wall_config, wall_scene) -> Path:
+    """A run folder as nerfstudio lays it out, with an empty checkpoint."""
+    config = wall_config(wall_scene, tmp_path, steps=1)
     config.save_config()
-    run = config.get_base_dir()
     config.get_checkpoint_dir().mkdir()
     torch.save({"step": 0, "pipeline": {}}, config.get_checkpoint_dir() / "step-000000000.ckpt")
-    return run
+    return config.get_base_dir()
 
 
 def scene_of(run: Path) -> TrainedScene:
@@ -59,8 +58,7 @@ def test_what_cannot_be_a_scene_says_what_is_wrong(trained_walls, tmp_path):
         manager_of(trained_walls, images_per_step=0)
 
 
-def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(wall_config, wall_scene, tmp_path):
-    run = make_run(tmp_path, wall_config, wall_scene)
+def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(run):
     config, text = run / "config.yml", (run / "config.yml").read_text()
     parser = "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
     config.write_text(text.replace(parser, "json.JSONDecoder"))
@@ -74,8 +72,7 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(wall_config, wa
     assert log.call_args.args[0].endswith("settings that its dataparser no longer has are left out: frame_leap")
 
 
-def test_code_in_a_config_is_never_run(wall_config, wall_scene, tmp_path):
-    run = make_run(tmp_path, wall_config, wall_scene)
+def test_code_in_a_config_is_never_run(run, tmp_path):
     config, trap = run / "config.yml", tmp_path / "sprung"
     bomb = f"!!python/object/apply:os.system ['touch {trap}']"
     config.write_text(config.read_text().replace("frame_stride: 1", f"frame_stride: {bomb}"))
@@ -87,8 +84,7 @@ def test_code_in_a_config_is_never_run(wall_config, wall_scene, tmp_path):
     assert not trap.exists()
 
 
-def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(wall_config, wall_scene, tmp_path):
-    run = make_run(tmp_path, wall_config, wall_scene)
+def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(run, wall_scene):
     moved = torch.eye(4)[:3]
     moved[0, 3] = 0.5
     (run / "dataparser_transforms.json").write_text(json.dumps({"transform": moved.tolist(), "scale": 1.0}))

@@ -21,14 +21,13 @@ from pointsplat_ns.refiner.weights import read_metadata
 
 
 def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
-    config, trainer, _ = trained
+    config, trainer = trained
     (path,) = config.get_checkpoint_dir().iterdir()
     state = torch.load(path, map_location="cpu", weights_only=True)
     refiner = trainer.pipeline.model.refiner
-    names = {f"_model.refiner.{name}" for name in refiner.state_dict()}
-    assert set(state["pipeline"]) == names | {"_model.device_indicator_param", "_extra_state"}
-    assert [name.split("/")[0] for name in state["pipeline"]["_extra_state"]["trained_on"]] == ["wall-a"]
-    assert all(torch.equal(state["pipeline"][f"_model.refiner.{n}"], v) for n, v in refiner.state_dict().items())
+    assert [name.split("/")[0] for name in state["pipeline"].pop("_extra_state")["trained_on"]] == ["wall-a"]
+    wanted = {f"_model.refiner.{name}": value for name, value in refiner.state_dict().items()}
+    assert equal(state["pipeline"], {**wanted, "_model.device_indicator_param": torch.empty(0)})
     parameters = sum(p.numel() for p in refiner.parameters())
     assert path.stat().st_size < 4 * 3 * parameters + 500_000, "three floats a parameter: itself and Adam's two"
     assert set(state["optimizers"]) == set(REFINER_RATES)
@@ -37,11 +36,9 @@ def test_the_checkpoint_holds_the_network_and_nothing_else(trained):
 
 
 def test_the_network_is_saved_by_itself_at_the_end(trained):
-    config, trainer, _ = trained
+    config, trainer = trained
     path = config.get_base_dir() / RUN_FILES.refiner
-    loaded = read_refiner(path).state_dict()
-    expected = trainer.pipeline.model.refiner.state_dict()
-    assert loaded.keys() == expected.keys() and all(torch.equal(loaded[n], v) for n, v in expected.items())
+    assert equal(read_refiner(path).state_dict(), trainer.pipeline.model.refiner.state_dict())
     about = read_metadata(path)
     model = {name: getattr(config.pipeline.model, name) for name in MODEL_METADATA}
     assert {name: about[name] for name in model} == {**model, "more_keeps": list(model["more_keeps"])}
@@ -50,27 +47,20 @@ def test_the_network_is_saved_by_itself_at_the_end(trained):
     assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000009.ckpt"]
 
 
-def step_by_step(config, steps):
-    """A trainer, and after each of the steps its weights with running statistics, its optimisers' state, metrics."""
-    torch.manual_seed(1)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    history = []
-    for step in steps:
-        _, _, metrics = trainer.pipeline.train() and trainer.train_iteration(step)
-        optimizers = {name: o.state_dict()["state"] for name, o in trainer.optimizers.optimizers.items()}
-        history.append(copy.deepcopy((trainer.pipeline.model.refiner.state_dict(), optimizers, metrics)))
-    return trainer, history
-
-
 def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, tmp_path):
     config = dense_config(three_rooms, tmp_path, 4)
     config.pipeline.model.norm = "batch"  # has running statistics
+    trainer, history = config.setup(local_rank=0, world_size=1), []
     with broken("nan", {1}), mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log:
-        trainer, history = step_by_step(config, range(3))
+        trainer.setup()
+        for step in range(3):
+            _, _, metrics = trainer.pipeline.train() and trainer.train_iteration(step)
+            moments = {
+                name: optimizer.state_dict()["state"] for name, optimizer in trainer.optimizers.optimizers.items()
+            }
+            history.append(copy.deepcopy((trainer.pipeline.model.refiner.state_dict(), moments, metrics)))
     weights, states, metrics = zip(*history, strict=True)
     assert equal(weights[1], weights[0]) and equal(states[1], states[0])
-    assert any("running" in name for name in weights[0])
     moved = [name for name in weights[0] if not torch.equal(weights[2][name], weights[1][name])]
     assert any("running" in name for name in moved) and any("heads" in name for name in moved)
     scene = trainer.pipeline.datamanager.scenes[metrics[1]["scene"]].name
@@ -87,8 +77,8 @@ def test_losses_do_not_depend_on_what_stays_in_memory(three_rooms, run_training,
         config.pipeline.model.more_keeps = (0.3,)
         config.pipeline.datamanager.cache_gigabytes = gigabytes
         trainer, losses = run_training(config)
-        results.append((losses, trainer.pipeline.model.refiner.state_dict()))
-    assert results[0][0] == results[1][0] and equal(results[0][1], results[1][1])
+        results.append({"losses": losses, **trainer.pipeline.model.refiner.state_dict()})
+    assert equal(*results)
 
 
 @pytest.fixture(scope="module")
@@ -151,14 +141,10 @@ def test_one_network_learns_at_several_budgets_and_shows_the_first(trained_walls
     pipeline = config.pipeline.setup(device="cpu", test_mode="val").train()
     model, cache = pipeline.model, pipeline.datamanager.cache
 
-    def met(keep: float) -> bool:
-        return any(cache.get(("pruned", s.name, model.config.prune_settings(keep))) for s in model.scenes)
-
-    for step in range(40):
+    for step in range(12):  # by chance one of three is not met in one of 40 seeds; the seed is fixed
         pipeline.get_train_loss_dict(step)
-        if all(met(keep) for keep in (0.5, 0.25, 40.0)):
-            break
-    assert step < 39
+    for keep in (0.5, 0.25, 40.0):
+        assert any(cache.get(("pruned", s.name, model.config.prune_settings(keep))) for s in model.scenes)
     assert len(model.eval().refine(0)) == round(0.5 * len(model.scenes[0].read_dense()))
 
 

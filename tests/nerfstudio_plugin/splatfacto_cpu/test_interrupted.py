@@ -181,9 +181,9 @@ def test_many_broken_steps_in_a_row_stop_a_training_and_few_do_not(
     assert trainer.skipped.total() == 5 and len(losses) == 12
     config.set_timestamp()
     message = r"stopped at step 7: .* in the last 3 steps, which were skipped \(.*: \d.*\); .*--load-dir .*"
-    with broken("nan", range(5, 12)), pytest.raises(DataError, match=message) as caught:
+    with broken("nan", range(5, 12)), pytest.raises(DataError, match=message):
         run_training(config)
-    assert "\n" not in str(caught.value) and (config.get_checkpoint_dir() / "step-000000007.ckpt").is_file()
+    assert (config.get_checkpoint_dir() / "step-000000007.ckpt").is_file()
 
 
 def test_a_training_takes_tiny_numbers_as_zero_also_in_threads_and_only_while_it_runs(started, monkeypatch):
