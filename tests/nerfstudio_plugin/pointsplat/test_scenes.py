@@ -24,8 +24,6 @@ from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, data
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D, Views
 
-NUM_TRAIN, NUM_HELD_OUT = 9, 2  # of the wall's 11 frames, every tenth held out
-
 
 def manager_of(folder: Path, **settings):
     return ScenesDataManagerConfig(data=folder, cache_gigabytes=0.01, **settings).setup(test_mode="val")
@@ -79,7 +77,7 @@ def test_code_in_a_config_is_never_run(run, tmp_path):
     assert bomb in config.read_text()
     with mock.patch.object(os, "system", side_effect=AssertionError("the config was run")):
         scene = scene_of(run)
-        assert len(scene.train_frames) == NUM_TRAIN, "the default stands where the config holds an object"
+        assert len(scene.train_frames) == 9, "the default stands where the config holds an object"
         manager_of(run)
     assert not trap.exists()
 

@@ -55,9 +55,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_counted(three_rooms, t
         trainer.setup()
         for step in range(3):
             _, _, metrics = trainer.pipeline.train() and trainer.train_iteration(step)
-            moments = {
-                name: optimizer.state_dict()["state"] for name, optimizer in trainer.optimizers.optimizers.items()
-            }
+            moments = {name: adam.state_dict()["state"] for name, adam in trainer.optimizers.optimizers.items()}
             history.append(copy.deepcopy((trainer.pipeline.model.refiner.state_dict(), moments, metrics)))
     weights, states, metrics = zip(*history, strict=True)
     assert equal(weights[1], weights[0]) and equal(states[1], states[0])
