@@ -40,11 +40,9 @@ class RasterizerOptions:
             return "rasterizer: gsplat"
         if device.type != "cpu":
             return "rasterizer: torch"
-        off = self.compiled is False
-        why = "as --pipeline.model.compiled is False" if off else KERNELS.why_missing
-        return (
-            f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
-        )
+        why = "as --pipeline.model.compiled is False" if self.compiled is False else KERNELS.why_missing
+        slow = f"torch, several times slower than compiled kernels: {why}"
+        return f"rasterizer: {slow if why else 'compiled'}"
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
         """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""

@@ -45,7 +45,6 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
     """
 
     _target: type = field(default_factory=lambda: SeededScanNetpp)
-    """target class to instantiate"""
     skip_bad: bool = True
     """Leave out frames with is_bad: blurred ones, or with shadows of the photographer."""
     load_seed_points: bool = True

@@ -40,16 +40,13 @@ from pointsplat_ns.tradeoff.points import (
 from pointsplat_ns.tradeoff.recommend import next_best, recommend
 from pointsplat_ns.views import spread_indices
 
-KEEP = ("70%", "50%", "30%", "20%", "10%", "5%")
-"""Budgets of a table, unless others are named."""
-
 
 @normal_mode
 def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,
     *,
-    keep: Sequence[Keep | str] = KEEP,
+    keep: Sequence[Keep | str] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
     by: Sequence[str] = ("merge",),
     repairs: Sequence[str] = ("none", "quick"),
@@ -102,8 +99,8 @@ def measure_tradeoff(
         ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
         ...     options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
         ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
-        >>> [point.key for point in found.points]
-        ['dense', '10pct']
+        >>> [point.key for point in found.points], found.point("10pct").gaussians
+        (['dense', '10pct'], 30)
     """
     check_options(keep, by, repairs, within, views)
     path, folder = Path(scene), Path(folder)

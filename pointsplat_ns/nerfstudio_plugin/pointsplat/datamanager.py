@@ -145,7 +145,7 @@ class ScenesDataManager(DataManager):
     @property
     def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Held-out photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
+        return None if self.test_mode == "inference" else self.scenes[self.shown].frames("test").dataset
 
     def setup_train(self) -> None:
         """Nothing: photos are read when they are needed."""
@@ -154,8 +154,8 @@ class ScenesDataManager(DataManager):
 
     def training_frames(self, scene: int) -> Frames:
         """The training targets of a scene: its photos, or the dense scene's own renders."""
-        scene_at = self.scenes[scene]
-        return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
+        found = self.scenes[scene]
+        return found.frames("train") if self.supervision == "photos" else found.rendered["train"]
 
     def place(self, step: int) -> int:
         """The place of this process in the common sequence of scenes, at one of its steps."""
@@ -181,7 +181,7 @@ class ScenesDataManager(DataManager):
     def next_eval_image(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
         """Index of an evaluation scene, and one of its held-out photos, if there is one."""
         scene = self.eval_indices[step % len(self.eval_indices)]
-        frames = self.scenes[scene].eval_frames
+        frames = self.scenes[scene].frames("test")
         chosen = random.Random(f"{self.config.seed} eval {step}").randrange(max(1, len(frames)))
         return scene, [frames[chosen]] if len(frames) > 0 else []
 

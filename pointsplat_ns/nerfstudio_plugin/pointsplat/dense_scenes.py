@@ -43,7 +43,7 @@ class DenseScene:
     """
 
     has_photos = False
-    """Whether ``train_frames`` and ``eval_frames`` are photos; otherwise they are the scene's own renders."""
+    """Whether ``frames`` are photos; otherwise they are the scene's own renders."""
     rasterize_mode: RasterizeMode = "classic"
     """Rasterize mode that the scene is rendered with."""
 
@@ -57,10 +57,11 @@ class DenseScene:
     ):
         self.name, self.source, self.cache = name, source, cache
         self._poses, self.device = poses, device
-        self.rendered_train = Frames(RenderedDataset(self, "train"), "uint8", cache, device)
-        """Renders of the dense scene from the training poses, in 8 bits as photos are."""
-        self.rendered_eval = Frames(RenderedDataset(self, "test"), "float32", cache, device)
-        """Renders of the dense scene from the held-out poses, not rounded."""
+        self.rendered: dict[Split, Frames] = {
+            "train": Frames(RenderedDataset(self, "train"), "uint8", cache, device),
+            "test": Frames(RenderedDataset(self, "test"), "float32", cache, device),
+        }
+        """Renders of the dense scene, in 8 bits as photos are from training poses, not rounded from held-out ones."""
 
     @cached_property
     def identity(self) -> str:
@@ -108,15 +109,9 @@ class DenseScene:
             cameras.metadata["eps2d"][1::2] = subsampled(views, max(RESOLUTION), max(size)).eps2d
         return cameras
 
-    @property
-    def train_frames(self) -> Frames:
-        """Training images: photos if the scene has them, else its own renders."""
-        return self.rendered_train
-
-    @property
-    def eval_frames(self) -> Frames:
-        """Held-out images: photos if the scene has them, else its own renders."""
-        return self.rendered_eval
+    def frames(self, split: Split) -> Frames:
+        """The images of a split: photos if the scene has them, else its own renders."""
+        return self.rendered[split]
 
 
 class RenderedDataset:
@@ -149,6 +144,5 @@ class RenderedDataset:
         }
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
-        _, data = frames[index]  # from the cache
+        _, data = self._scene.rendered[self._split][index]  # from the cache
         return {**data, "image": in_unit_range(data["image"])}

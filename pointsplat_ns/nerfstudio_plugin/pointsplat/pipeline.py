@@ -140,7 +140,7 @@ class PointSplatPipeline(VanillaPipeline):
             dense = scene.dense(keep=False)
             pruned, structure = model.pruned_scene(index, dense)
             variants = {"dense": dense.to(model.device), "pruned": pruned, "refined": model.refiner(pruned, structure)}
-            report = evaluate_scene(model, scene, variants, scene.eval_frames, lpips, output_path, progress=True)
+            report = evaluate_scene(model, scene, variants, scene.frames("test"), lpips, output_path, progress=True)
             report.seen_in_training = scene.identity in self.trained_on
             report.last_picture = None
             reports.append(report)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
@@ -104,6 +104,7 @@ class TrainedScene(DenseScene):
     ):
         super().__init__(name, run.checkpoint, cache, poses, device)
         self.run, self.has_photos, self.rasterize_mode = run, has_photos, run.rasterize_mode
+        self._photos: dict[Split, Frames] = {}
 
     @cached_property
     def identity(self) -> str:
@@ -150,30 +151,23 @@ class TrainedScene(DenseScene):
             )
         return outputs
 
-    def _frames(self, split: str) -> Frames:
-        scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
-        scale = float(scale) if isinstance(scale, (int, float)) else 1.0
-        dataset = UndistortedDataset(self._outputs(split), scale)
-        if split == "train":
-            dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
-        return Frames(dataset, cache=self.cache, device=self.device)
-
-    @cached_property
-    def train_frames(self) -> Any:
-        """Training photos at the run's training resolution, in the poses as the training corrected them; without data
+    def frames(self, split: Split) -> Frames:
+        """Photos at the run's training resolution, those of training in the poses as it corrected them; without data
         the scene's own renders."""
-        return self._frames("train") if self.has_photos else self.rendered_train
-
-    @cached_property
-    def eval_frames(self) -> Any:
-        """Held-out photos at the run's training resolution, or without data the scene's own renders."""
-        return self._frames("test") if self.has_photos else self.rendered_eval
+        if not self.has_photos:
+            return self.rendered[split]
+        if split not in self._photos:
+            scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
+            scale = float(scale) if isinstance(scale, (int, float)) else 1.0
+            dataset = UndistortedDataset(self._outputs(split), scale)
+            if split == "train":
+                dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
+            self._photos[split] = Frames(dataset, cache=self.cache, device=self.device)
+        return self._photos[split]
 
     def cameras(self, split: Split) -> Cameras:
         """The dataset's cameras, or sampled ones if the data is missing."""
-        if not self.has_photos:
-            return super().cameras(split)
-        return (self.train_frames if split == "train" else self.eval_frames).dataset.cameras
+        return self.frames(split).dataset.cameras if self.has_photos else super().cameras(split)
 
     def views(self, split: Split) -> Views:
         """The poses of a split, on the CPU. Raises DataError if there is none, or they are not usable."""
@@ -189,7 +183,7 @@ class TrainedScene(DenseScene):
     def photos(self, split: Split) -> RunPhotos:
         """The photos of a split, read when they are asked for. Raises DataError as :meth:`views`."""
         self.views(split)
-        return RunPhotos(self, self.train_frames if split == "train" else self.eval_frames)
+        return RunPhotos(self, self.frames(split))
 
     def need_photos_as_rendered(self, instead: str) -> None:
         """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of its photos, which

@@ -23,7 +23,6 @@ class ReplicaDataParserConfig(DataParserConfig):
     """Posed photos, with or without depth images, in NICE-SLAM's or Semantic-NeRF's Replica layout"""
 
     _target: type = field(default_factory=lambda: ReplicaDataParser)
-    """target class to instantiate"""
     data: Path = Path("data/replica/office0")
     """Scene folder, with traj.txt and results/ (cam_params.json in it or in the folder above), or a sequence with
     traj_w_c.txt and rgb/."""

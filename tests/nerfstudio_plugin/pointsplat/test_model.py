@@ -45,7 +45,7 @@ def test_a_scene_is_drawn_as_it_was_trained(trained_walls):
     place = "pointsplat_ns.nerfstudio_plugin.cameras.rasterization"
     with mock.patch(place, side_effect=rasterization) as drawn, torch.no_grad():
         for index in (0, 1):
-            pipeline.model.losses(index, [pipeline.datamanager.scenes[index].eval_frames[0]])
+            pipeline.model.losses(index, [pipeline.datamanager.scenes[index].frames("test")[0]])
     modes = [(call.kwargs["rasterize_mode"], call.kwargs["sh_degree"]) for call in drawn.call_args_list]
     assert modes == [("classic", 3), ("antialiased", 1)]
 
@@ -59,7 +59,7 @@ def test_weights_of_another_network_are_refused(trained, trained_walls, other):
 
 def test_a_mask_hides_what_it_covers_from_the_loss(trained_walls):
     pipeline = pipeline_of(trained_walls)
-    camera, data = pipeline.datamanager.scenes[0].eval_frames[0]
+    camera, data = pipeline.datamanager.scenes[0].frames("test")[0]
     mask = torch.zeros((48, 64, 1), dtype=torch.bool)
     with torch.no_grad():
         assert float(pipeline.model.losses(0, [(camera, {**data, "mask": mask})])[1]["l1"]) == 0
@@ -68,7 +68,7 @@ def test_a_mask_hides_what_it_covers_from_the_loss(trained_walls):
 
 def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips):
     pipeline = pipeline_of(trained_walls, lpips_weight=0.1, lpips_net="alex").train()
-    frame = pipeline.datamanager.scenes[0].eval_frames[0]
+    frame = pipeline.datamanager.scenes[0].frames("test")[0]
     _, losses, _ = pipeline.model.losses(0, [frame])
     sum(losses.values()).backward()
     assert all(p.grad.isfinite().all() for p in pipeline.model.refiner.parameters() if p.grad is not None)
@@ -196,7 +196,7 @@ def test_pixel_losses_at_extremes(name, scale):
 def test_the_viewer_gets_what_it_reads_of_a_splatfacto_model(evaluated, trained_walls):
     model = evaluated.model
     assert isinstance(model, SplatfactoModel)
-    camera, _ = evaluated.datamanager.scenes[1].eval_frames[0]
+    camera, _ = evaluated.datamanager.scenes[1].frames("test")[0]
     outputs = model.get_outputs_for_camera(camera)
     sizes = {name: tuple(value.shape) for name, value in outputs.items()}
     assert sizes == {"rgb": (48, 64, 3), "depth": (48, 64, 1), "accumulation": (48, 64, 1), "background": (48, 64, 3)}

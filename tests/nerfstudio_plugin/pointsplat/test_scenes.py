@@ -77,7 +77,7 @@ def test_code_in_a_config_is_never_run(run, tmp_path):
     assert bomb in config.read_text()
     with mock.patch.object(os, "system", side_effect=AssertionError("the config was run")):
         scene = scene_of(run)
-        assert len(scene.train_frames) == 9, "the default stands where the config holds an object"
+        assert len(scene.frames("train")) == 9, "the default stands where the config holds an object"
         manager_of(run)
     assert not trap.exists()
 
@@ -86,13 +86,13 @@ def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(run, w
     moved = torch.eye(4)[:3]
     moved[0, 3] = 0.5
     (run / "dataparser_transforms.json").write_text(json.dumps({"transform": moved.tolist(), "scale": 1.0}))
-    for split in ("train_frames", "eval_frames"):
+    for split in ("train", "test"):
         with pytest.raises(DataError, match="no longer in the frame.*differs by 0.5") as caught:
-            getattr(scene_of(run), split)
+            scene_of(run).frames(split)
         assert str(wall_scene) in str(caught.value) and "\n" not in str(caught.value)
     (run / "dataparser_transforms.json").write_text(json.dumps({"transform": torch.eye(4)[:3].tolist(), "scale": 1.01}))
     with pytest.raises(DataError, match="the scale is 1 and was 1.01"):
-        _ = scene_of(run).train_frames
+        _ = scene_of(run).frames("train")
 
 
 def photos_of(manager, step):
@@ -155,7 +155,7 @@ def test_what_holds_no_scene_says_so(rooms, tmp_path):
 def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, monkeypatch):
     monkeypatch.setattr(dense_scenes, "sample_views", sample_views)  # anew for each
     scene = dense_scene(rooms)
-    train, held_out = (frames.dataset.cameras.camera_to_worlds for frames in (scene.train_frames, scene.eval_frames))
+    train, held_out = (scene.frames(split).dataset.cameras.camera_to_worlds for split in ("train", "test"))
     assert len(train) == 6 and len(held_out) == 1
     assert torch.equal(dense_scene(rooms).cameras("train").camera_to_worlds, train)
     assert torch.cdist(train.reshape(-1, 12), held_out.reshape(-1, 12)).min() > 1e-3
@@ -164,7 +164,7 @@ def test_sampled_poses_are_the_same_each_time_and_none_is_in_both_splits(rooms, 
 def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
     scene = dense_scene(rooms)
     assert not scene.dense(keep=False).means.requires_grad
-    for frames, tolerance in ((scene.rendered_train, 0.5 / 255 + 1e-6), (scene.rendered_eval, 1e-6)):
+    for frames, tolerance in ((scene.rendered["train"], 0.5 / 255 + 1e-6), (scene.rendered["test"], 1e-6)):
         camera, data = frames[-1]
         poses, Ks = viewmats_from_opengl(camera.camera_to_worlds), camera.get_intrinsics_matrices()
         views = Views(poses, Ks, 32, 24, scene.background, **carried(camera))
@@ -172,9 +172,9 @@ def test_targets_are_the_dense_scenes_exact_renders_in_8_bits(rooms):
         # half a level where they are rounded, float32 noise where they are not
         torch.testing.assert_close(image, render(scene.read_dense(), views[0]), atol=tolerance, rtol=0)
         assert data["image_idx"] == len(frames) - 1 and image.std() > 0.05 and not data["image"].requires_grad
-    image = scene.rendered_train[0][1]["image"]
+    image = scene.rendered["train"][0][1]["image"]
     assert image.dtype == torch.uint8
-    assert torch.equal(scene.rendered_train.dataset[0]["image"], image / 255), "what the viewer shows"
+    assert torch.equal(scene.rendered["train"].dataset[0]["image"], image / 255), "what the viewer shows"
     # Every second training picture is subsampled from one of the size that people look at.
-    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_train] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
-    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered_eval] == [EPS2D]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered["train"]] == 3 * [EPS2D, EPS2D * (32 / 1920) ** 2]
+    assert [carried(camera)["eps2d"] for camera, _ in scene.rendered["test"]] == [EPS2D]
