@@ -38,6 +38,13 @@ def dataset_views(path: Path | str, split: Split = "train", data: Path | str | N
     Raises:
         SceneError: if ``path`` is not a run, or the run's data is missing.
         DataError: if the poses are not usable, the split has none, or nerfstudio is not installed.
+
+    Example:
+        >>> import pointsplat_ns as ps
+        >>> ps.dataset_views("outputs/no_run")
+        Traceback (most recent call last):
+        ...
+        pointsplat_ns.errors.SceneError: outputs/no_run: no such file or folder; expected a nerfstudio run
     """
     return _scene_at(path, data).views(split)
 

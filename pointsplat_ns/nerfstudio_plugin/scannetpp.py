@@ -124,8 +124,7 @@ def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataPars
 
 def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set[str]]:
     """The content of the transforms file with all photos either in ``frames`` or in ``test_frames``; and the names of
-    hidden photos, those of official tests, of which only the poses are published. Raises DataError if the file cannot
-    be used, or a training photo is missing."""
+    hidden photos, those of official tests. Raises DataError if the file, or a training photo, cannot be used."""
     path, photos = config.data / config.transforms_path, config.data / config.images_dir
     listed_in = path.parent.parent / "train_test_lists.json"
     expected = "expected JSON with frames, as ScanNet++ has it"

@@ -35,8 +35,7 @@ STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
 MOST_SKIPPED_IN_A_ROW = 10
-"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
-and names their photos or scenes. One that is broken among sound ones stops nothing."""
+"""Number of steps in a row that may be skipped, before training stops and names their photos or scenes."""
 
 
 @dataclass

@@ -88,7 +88,18 @@ class Point:
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """All points of a scene. The first is the dense scene."""
+    """All points of a scene. The first is the dense scene.
+
+    Example:
+        >>> import tempfile
+        >>> import pointsplat_ns as ps
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ps.save(ps.example_room()[::200][:300], f"{folder}/room.ply")
+        ...     options = {"keep": ("10%",), "repairs": ("none",), "views": 2, "resolution": "64x48"}
+        ...     found = ps.measure_tradeoff(f"{folder}/room.ply", f"{folder}/trade", **options)
+        >>> found.point("10pct").gaussians
+        30
+    """
 
     scene: str
     """Name of the scene."""

@@ -34,11 +34,9 @@ if TYPE_CHECKING:
 
 
 def dataparser_of(run: Run) -> DataParser:
-    """The dataparser that a run was trained with, with the same settings; those that it does not know are logged.
-
-    The name in the run's file is looked up among the classes that nerfstudio or an installed plugin registers, and is
-    never imported. Raises SceneError if it is not there.
-    """
+    """The dataparser that a run was trained with, with the same settings; those that it does not know are logged. Its
+    name is looked up among the classes that nerfstudio or an installed plugin registers, and is never imported.
+    Raises SceneError if it is not there."""
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
     classes = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}

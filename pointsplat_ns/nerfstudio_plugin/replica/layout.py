@@ -56,11 +56,9 @@ class PinholeParams:
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
-
-        If it is exactly (w / 2, h / 2) in the file, coordinates start at the corner of the image. Otherwise the centre
-        of the first pixel is 0, as in Replica's own file (599.5 of 1200) and in OpenCV, and half a pixel is added.
-        """
+        """Principal point in pixels from the corner of the image, as in rasterizers. If it is exactly (w / 2, h / 2) in
+        the file, it is that there, too. Otherwise the centre of the first pixel is 0, as in Replica's own file (599.5
+        of 1200) and in OpenCV."""
         shift = 0.0 if (self.cx, self.cy) == (self.width / 2, self.height / 2) else 0.5
         return self.cx + shift, self.cy + shift
 

@@ -208,7 +208,7 @@ def test_what_is_not_finite_is_null_in_a_report_and_not_in_the_log(trained, some
     _, trainer, _ = trained
     pipeline = trainer.pipeline
     frames = list(pipeline.datamanager.fixed_indices_eval_dataloader)[:1]
-    with mock.patch.object(type(pipeline.datamanager), "fixed_indices_eval_dataloader", frames):
+    with mock.patch.object(pipeline.datamanager, "fixed_indices_eval_dataloader", frames):
         report = pipeline.get_average_eval_image_metrics(get_std=True)
         log = pipeline.get_average_eval_image_metrics(step=3, get_std=True)
     assert report["psnr"] > 15 and 0 < report["ssim"] <= 1 and report["fps"] > 0
