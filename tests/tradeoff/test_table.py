@@ -159,12 +159,12 @@ def test_a_command_makes_the_scene_that_was_measured(setting, room, room_views, 
     path, dense = Path("the room.ply"), ps.load(room)
     path.write_bytes(room.read_bytes())
     subject = Subject(dense, path, lambda: ViewSource(dense))
-    made, names = make(subject, setting, lambda what, share: None), subject.names(setting)
+    (made, _), names = make(subject, setting, lambda what, share: None), subject.names(setting)
     program, *words = shlex.split(names["command"])
     assert program == "pointsplat"
     main(words)
     written = Path(f"the-room_{names['key']}.ply")
-    assert same_bits(ps.load(written), made.scene) and written.stat().st_size == ply_bytes(setting.count, 1)
+    assert same_bits(ps.load(written), made) and written.stat().st_size == ply_bytes(setting.count, 1)
 
 
 @pytest.mark.parametrize(("loss", "key"), [(0, "dense"), (0.1, "half"), (0.49, "half"), (0.5, "third"), (3, "tenth")])

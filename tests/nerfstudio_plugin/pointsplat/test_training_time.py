@@ -31,10 +31,10 @@ def timed(three_rooms, folder, seconds, **changes):
 
 # half of the way from 1 to 0.02 is 0.51
 COSINE = {0.0: 0.0, 1e-300: 2e-299, 0.025: 0.5, 0.05: 1.0, 0.525: 0.51, 1.0: 0.02, 1.5: 0.02, 1e300: 0.02}
-STEP = {0.0: 1.0, math.nextafter(0.6, 0): 1.0, 0.6: 0.1, 1e300: 0.1}
+DROPPED = {0.0: 1.0, math.nextafter(0.6, 0): 1.0, 0.6: 0.1, 1e300: 0.1}
 
 
-@pytest.mark.parametrize(("schedule", "factors"), [("cosine", COSINE), ("step", STEP)])
+@pytest.mark.parametrize(("schedule", "factors"), [("cosine", COSINE), ("step", DROPPED)])
 def test_rates_follow_the_share_of_the_training_also_at_extremes(schedule, factors):
     found = {share: rate_factor_at(share, schedule) for share in factors}
     assert found == pytest.approx(factors, rel=1e-12, abs=0)
