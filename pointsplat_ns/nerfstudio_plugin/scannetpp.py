@@ -112,13 +112,13 @@ class SeededScanNetpp(ScanNetpp):
 
 
 def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:
-    """The config with the paths of the first source whose photos are there. It stays as it is if one of its paths was
-    given, or there is no source."""
+    """The config with the paths of the first source whose photos are there, unless one of its paths was given."""
     names = ("transforms_path", "images_dir", "masks_dir", "colmap_path")
     if tuple(map(Path, SOURCES[0])) == tuple(Path(getattr(config, name)) for name in names):
         for paths in SOURCES:
             if (config.data / paths[0]).is_file() and (config.data / paths[1]).is_dir():
-                return dataclasses.replace(config, **dict(zip(names, map(Path, paths), strict=True)))
+                located: dict[str, Any] = dict(zip(names, map(Path, paths), strict=True))
+                return dataclasses.replace(config, **located)
     return config
 
 

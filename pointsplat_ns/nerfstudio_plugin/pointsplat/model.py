@@ -238,8 +238,8 @@ class PointSplatModel(SplatfactoModel):
             outputs = self.draw(refined, scene, camera)
             mask = data.get("mask", 1)
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
-        pixel_loss = PIXEL_LOSSES[config.pixel_loss]
-        losses = {config.pixel_loss: torch.stack([pixel_loss(render - photo) for render, photo in pairs]).mean()}
+        pixel_loss = torch.stack([PIXEL_LOSSES[config.pixel_loss](render - photo) for render, photo in pairs]).mean()
+        losses: dict[str, Tensor] = {config.pixel_loss: pixel_loss}
         if config.lpips_weight > 0 and self.no_lpips_reason is None:
             cheap: Literal["alex", "vgg"] = "vgg" if self.device.type == "cuda" else "alex"
             try:
