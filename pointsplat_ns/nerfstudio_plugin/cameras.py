@@ -40,11 +40,9 @@ class RasterizerOptions:
             return "rasterizer: gsplat"
         if device.type != "cpu":
             return "rasterizer: torch"
-        off = self.compiled is False
-        why = "as --pipeline.model.compiled is False" if off else KERNELS.why_missing
-        return (
-            f"rasterizer: torch, several times slower than compiled kernels: {why}" if why else "rasterizer: compiled"
-        )
+        why = "as --pipeline.model.compiled is False" if self.compiled is False else KERNELS.why_missing
+        slow = f"torch, several times slower than compiled kernels: {why}"
+        return f"rasterizer: {slow if why else 'compiled'}"
 
     def rasterize(self, training: bool, **arguments) -> tuple[Tensor, Tensor, dict]:
         """:func:`~pointsplat_ns.rasterizer.rasterization` with these options; exact outside of training."""
@@ -53,11 +51,8 @@ class RasterizerOptions:
 
 
 def cameras_of_views(views: Views) -> Cameras:
-    """Views as nerfstudio cameras (C,), float32 on the CPU. Their poses are camera-to-world, in OpenGL axes.
-
-    nerfstudio's cameras have no near plane and no ``eps2d``: these go into their metadata, where :func:`carried` finds
-    them. The background and the rasterize mode are not carried over.
-    """
+    """Views as nerfstudio cameras (C,), float32 on the CPU, without background and rasterize mode. nerfstudio's cameras
+    have no near plane and no ``eps2d``: these go into their metadata, where :func:`carried` finds them."""
     poses, Ks = viewmats_to_opengl(views.viewmats.double().cpu()).float(), views.Ks.float().cpu()
     fx, fy, cx, cy = (Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     ours = {"near_plane": views.near_plane, "eps2d": views.eps2d}
@@ -81,12 +76,9 @@ def carried(cameras: Cameras) -> dict[str, float]:
 
 
 def need_pinhole(camera: Cameras) -> None:
-    """Raise a DataError if a camera (1,) has a lens: a pinhole's picture is not what it sees.
-
-    Datasets have none (:mod:`~pointsplat_ns.nerfstudio_plugin.undistorted`); camera paths of the viewer may. The viewer
-    itself draws in a thread, which an error would end: there such a camera is previewed as a pinhole, as nerfstudio's
-    Splatfacto does.
-    """
+    """Raise a DataError if a camera (1,) has a lens. Datasets have none; camera paths of the viewer may. The viewer
+    draws in a thread, which an error would end: there such a camera is drawn as a pinhole, as by nerfstudio's
+    Splatfacto."""
     kind = CameraType(int(camera.camera_type))
     if kind != CameraType.PERSPECTIVE and threading.current_thread() is threading.main_thread():
         raise DataError(

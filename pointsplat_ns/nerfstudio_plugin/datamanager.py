@@ -13,8 +13,7 @@ from typing import Literal
 
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
-from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
-from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache, UndistortedDataset
 
 
 @dataclass
@@ -31,10 +30,7 @@ class LazyImageDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
-    """Full images and cameras, in the order that nerfstudio's datamanager gives for the same seed, decoded lazily.
-
-    Its datasets hold undistorted photos and pinhole cameras.
-    """
+    """Full images, undistorted, and pinhole cameras, in the order of nerfstudio's datamanager for the same seed."""
 
     config: LazyImageDatamanagerConfig
     latest_photo: str = ""
@@ -48,20 +44,12 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
     @cached_property
     def train_frames(self) -> Frames:
         """Training photos by index."""
-        return self._frames_of(self.train_dataset)
+        return Frames(self.train_dataset, self.config.cache_images_type, self.frame_cache, self.device)
 
     @cached_property
-    def eval_frames(self) -> Frames:
-        """Held-out photos by index."""
-        return self._frames_of(self.eval_dataset)
-
-    def _frames_of(self, dataset: UndistortedDataset) -> Frames:
-        return Frames(dataset, self.config.cache_images_type, self.frame_cache, self.device)
-
-    @property
     def fixed_indices_eval_dataloader(self) -> Frames:  # type: ignore[override]  # nerfstudio's is a list
-        """Every held-out frame in order, decoded one after the other."""
-        return self.eval_frames
+        """Held-out photos by index."""
+        return Frames(self.eval_dataset, self.config.cache_images_type, self.frame_cache, self.device)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a training photo (the first one's, if they differ)."""
@@ -83,4 +71,4 @@ class LazyImageDatamanager(FullImageDatamanager[UndistortedDataset]):
         index = self.eval_unseen_cameras.pop(random.randint(0, len(self.eval_unseen_cameras) - 1))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        return self.eval_frames[index]
+        return self.fixed_indices_eval_dataloader[index]

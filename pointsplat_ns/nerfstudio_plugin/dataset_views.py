@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,12 +12,11 @@ from pointsplat_ns.io.runs import may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import Up
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.registration import import_nerfstudio
-from pointsplat_ns.photos.examples import Example, Photos
+from pointsplat_ns.photos.examples import Photos
 from pointsplat_ns.photos.posed_scene import check_photos
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:
-    from pointsplat_ns.nerfstudio_plugin.frames import Frames
     from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import Split
     from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
@@ -44,13 +41,12 @@ def dataset_views(path: Path | str, split: Split = "train", data: Path | str | N
 
     Example:
         >>> import pointsplat_ns as ps
-        >>> ps.dataset_views("outputs/kitchen/splatfacto/2026-01-01_120000", "test")
+        >>> ps.dataset_views("outputs/no_run")
         Traceback (most recent call last):
         ...
-        pointsplat_ns.errors.SceneError: outputs/kitchen/splatfacto/2026-01-01_120000: no such file or folder; \
-expected a nerfstudio run
+        pointsplat_ns.errors.SceneError: outputs/no_run: no such file or folder; expected a nerfstudio run
     """
-    return _views_of(*_open(path, split, data), split)
+    return _scene_at(path, data).views(split)
 
 
 def view_source(
@@ -69,9 +65,10 @@ def view_source(
 def run_photos(path: Path | str, split: Split = "train", data: Path | str | None = None) -> Photos:
     """The photos of a split of a run's dataset, read when they are asked for. Arguments and errors are those of
     :func:`dataset_views`; a photo that cannot be used is a DataError when it is asked for."""
-    scene, frames = _open(path, split, data, photos=True)
-    _views_of(scene, frames, split)
-    return RunPhotos(scene, frames)
+    scene = _scene_at(path, data)
+    if split == "train":
+        scene.need_photos_as_rendered("leave the photos out")
+    return scene.photos(split)
 
 
 def need_named_data(scene: object, data: Path | str | None) -> None:
@@ -83,31 +80,12 @@ def need_named_data(scene: object, data: Path | str | None) -> None:
     if not isinstance(scene, (str, Path)) or not may_be_run(scene):
         what = scene if isinstance(scene, (str, Path)) else "a scene in memory"
         raise SceneError(f"{what}: no run, so it has no data at {data}; expected a run, or no --data")
-    trained, frames = _open(scene, "train", data)
-    _views_of(trained, frames, "train")
-    check_photos(trained.read_dense(), RunPhotos(trained, frames), data)
+    trained = _scene_at(scene, data)
+    check_photos(trained.read_dense(), trained.photos("train"), data)
 
 
-class RunPhotos(Sequence[Example]):
-    """Photos of a split, and the views on the CPU that they show once undistorted."""
-
-    def __init__(self, scene: TrainedScene, frames: Frames):
-        self._scene, self._frames = scene, frames
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: int) -> Example:  # type: ignore[override]
-        from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
-
-        camera, data = self._frames[index]
-        view = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
-        return Example(view, data["image"][..., :3], data.get("mask"))
-
-
-def _open(path: Path | str, split: Split, data: Path | str | None, photos: bool = False) -> tuple[TrainedScene, Frames]:
-    """The scene of a run, and the frames of a split. With ``photos``, these stay in memory as far as there is room, and
-    training photos that colours were fitted to are a DataError."""
+def _scene_at(path: Path | str, data: Path | str | None) -> TrainedScene:
+    """The scene of a run. Its photos stay in memory as far as there is room."""
     run = open_run(path, data=data)  # before nerfstudio is imported, which takes seconds
     try:
         need("nerfstudio", "reading the photos and poses of a run")
@@ -116,23 +94,6 @@ def _open(path: Path | str, split: Split, data: Path | str | None, photos: bool 
     import_nerfstudio()
 
     from pointsplat_ns.nerfstudio_plugin.frames import MemoryCache
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene, need_photos_as_rendered
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
-    if photos and split == "train":
-        need_photos_as_rendered(run, "leave the photos out")
-    scene = TrainedScene(scene_name(run), run, MemoryCache.of() if photos else MemoryCache(0))
-    return scene, scene.train_frames if split == "train" else scene.eval_frames
-
-
-def _views_of(scene: TrainedScene, frames: Frames, split: Split) -> Views:
-    """The poses of frames, on the CPU."""
-    from pointsplat_ns.nerfstudio_plugin.cameras import views_of_cameras
-
-    cameras = frames.dataset.cameras
-    if len(cameras) == 0:
-        raise DataError(f"{scene.run.data}: no pose in the {split} split; expected at least one")
-    try:
-        views = views_of_cameras(cameras, scene.background, scene.rasterize_mode)
-    except DataError as error:
-        raise DataError(f"{scene.run.data}: {error}") from error
-    return dataclasses.replace(views, viewmats=views.viewmats.detach().cpu(), Ks=views.Ks.detach().cpu())
+    return TrainedScene(scene_name(run), run, MemoryCache.of())

@@ -19,8 +19,7 @@ JIT_SCRIPT = "ignore:`torch.jit.script` is deprecated:FutureWarning:torch.jit._s
 
 
 def load_specification(name: str, build: Callable[[], Any]) -> Any:
-    """What ``build`` returns for nerfstudio's registry, or one line that says why a method or dataparser could not be
-    loaded.
+    """What ``build`` returns for nerfstudio's registry, or one line that says why it could not be loaded.
 
     nerfstudio does not guard the loading of entry points: one failing import would end every ``ns-*`` command. It does
     skip whatever is not a specification, and prints it in a warning.
@@ -32,10 +31,7 @@ def load_specification(name: str, build: Callable[[], Any]) -> Any:
 
 
 def errors_in_one_line() -> None:
-    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit status is 1.
-
-    nerfstudio's commands catch nothing, so a missing photo would print a page of traceback.
-    """
+    """Print an uncaught :class:`PointSplatError` in one line, without its traceback. The exit status is 1."""
     before = sys.excepthook
 
     def print_error(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
@@ -57,8 +53,8 @@ def quiet_nerfstudio() -> None:
 def import_nerfstudio() -> None:
     """Import the first modules of nerfstudio without the warnings that come with it.
 
-    Call it in code that nerfstudio does not run itself, before importing any module that needs nerfstudio. nerfstudio
-    loads plugins while it is itself only half imported; after this call its modules can be imported in any order.
+    nerfstudio loads plugins while it is itself only half imported; after this call its modules can be imported in any
+    order. Call it before importing any module that needs nerfstudio, in code that nerfstudio does not run itself.
     """
     quiet_nerfstudio()
     with warnings.catch_warnings():

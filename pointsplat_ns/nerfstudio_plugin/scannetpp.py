@@ -15,27 +15,24 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.scannetpp_dataparser import ScanNetpp, ScanNetppDataParserConfig
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import flip_camera_axes
 from pointsplat_ns.io.files import read_text
 from pointsplat_ns.system.tensors import INDICES
 
-SOURCES: tuple[dict[str, Any], ...] = tuple(
-    dict(zip(("transforms_path", "images_dir", "masks_dir", "colmap_path"), map(Path, paths), strict=True))
-    for paths in (
-        ("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap"),
-        # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
-        (
-            "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
-            "dslr/colmap",
-        ),
-        ("nerfstudio/transforms.json", "images", "masks", "colmap"),
-        ("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
-    )
+SOURCES = (
+    ("dslr/nerfstudio/transforms.json", "dslr/resized_images", "dslr/resized_anon_masks", "dslr/colmap"),
+    # The dataset's toolkit writes these: photos undistorted by OpenCV, or by COLMAP; frames of the iPhone's video.
+    (
+        "dslr/nerfstudio/transforms_undistorted.json", "dslr/undistorted_images", "dslr/undistorted_anon_masks",
+        "dslr/colmap",
+    ),
+    ("nerfstudio/transforms.json", "images", "masks", "colmap"),
+    ("iphone/nerfstudio/transforms.json", "iphone/rgb", "iphone/rgb_masks", "iphone/colmap"),
 )  # fmt: skip
-"""All photos that a scene may have, as settings of the dataparser. The first whose files are there are used."""
+"""Transforms, photos, masks and COLMAP's model of all photos that a scene may have. The first whose files are there are
+used."""
 
 
 @dataclass
@@ -48,12 +45,11 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
     """
 
     _target: type = field(default_factory=lambda: SeededScanNetpp)
-    """target class to instantiate"""
     skip_bad: bool = True
     """Leave out frames with is_bad: blurred ones, or with shadows of the photographer."""
     load_seed_points: bool = True
     """Start from COLMAP's points."""
-    colmap_path: Path = SOURCES[0]["colmap_path"]
+    colmap_path: Path = Path(SOURCES[0][-1])
     """Relative path to COLMAP's images and points3D, as text or binary files."""
     train_split_fraction: float | None = None
     """Train on this share of all photos and hold out the others, evenly spread, whatever the lists say."""
@@ -62,10 +58,7 @@ class SeededScanNetppDataParserConfig(ScanNetppDataParserConfig):
 @dataclass
 class SeededScanNetpp(ScanNetpp):
     """nerfstudio's ScanNet++ dataparser, which needs test_frames and all photos, uses bad frames and gives no seed
-    points.
-
-    The frame of all poses is nerfstudio's; bad and hidden ones count in its orientation, centre and scale, as there.
-    """
+    points. Bad and hidden frames count in the orientation, centre and scale of all poses, as there."""
 
     config: SeededScanNetppDataParserConfig
 
@@ -104,42 +97,34 @@ class SeededScanNetpp(ScanNetpp):
                 outputs.mask_filenames = [outputs.mask_filenames[i] for i in kept]
             outputs.cameras = outputs.cameras[torch.tensor(kept, **INDICES)]
         if split == "train" and self.config.load_seed_points:
-            outputs.metadata.update(self._seed_points(frames, outputs, located.data / located.colmap_path))
+            model = located.data / located.colmap_path
+            points = list(_read(model, "points3D").values()) if model.is_dir() else []
+            if not points:
+                CONSOLE.log(f"{model}: no points of COLMAP, so no seed points")
+                return outputs
+            poses = {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}
+            move, transform = _frame_of(model, poses), outputs.dataparser_transform.double()
+            xyz = torch.from_numpy(np.array([point.xyz for point in points]) @ move[:3, :3].T + move[:3, 3])
+            placed = (xyz @ transform[:, :3].T + transform[:, 3]) * outputs.dataparser_scale
+            outputs.metadata["points3D_xyz"] = placed.float()
+            outputs.metadata["points3D_rgb"] = torch.from_numpy(np.array([p.rgb for p in points], dtype=np.uint8))
         return outputs
-
-    def _seed_points(
-        self, frames: dict[str, dict[str, Any]], outputs: DataparserOutputs, folder: Path
-    ) -> dict[str, Tensor]:
-        """The points of a COLMAP model in the frame of the outputs."""
-        if not folder.is_dir() or not (points := _read(folder, "points3D").values()):
-            CONSOLE.log(f"{folder}: no points of COLMAP, so no seed points")
-            return {}
-        move = _frame_of(
-            folder, {name: np.array(frame["transform_matrix"], dtype=np.float64) for name, frame in frames.items()}
-        )
-        xyz = np.array([point.xyz for point in points]) @ move[:3, :3].T + move[:3, 3]
-        transform = outputs.dataparser_transform.double()
-        placed = torch.from_numpy(xyz) @ transform[:, :3].T + transform[:, 3]
-        return {
-            "points3D_xyz": (placed * outputs.dataparser_scale).float(),
-            "points3D_rgb": torch.from_numpy(np.array([point.rgb for point in points], dtype=np.uint8)),
-        }
 
 
 def _located(config: SeededScanNetppDataParserConfig) -> SeededScanNetppDataParserConfig:
-    """The config with the paths of the first source whose photos are there. It stays as it is if one of its paths was
-    given, or there is no source."""
-    if all(Path(getattr(config, name)) == path for name, path in SOURCES[0].items()):
-        for source in SOURCES:
-            if (config.data / source["transforms_path"]).is_file() and (config.data / source["images_dir"]).is_dir():
-                return dataclasses.replace(config, **source)
+    """The config with the paths of the first source whose photos are there, unless one of its paths was given."""
+    names = ("transforms_path", "images_dir", "masks_dir", "colmap_path")
+    if tuple(map(Path, SOURCES[0])) == tuple(Path(getattr(config, name)) for name in names):
+        for paths in SOURCES:
+            if (config.data / paths[0]).is_file() and (config.data / paths[1]).is_dir():
+                located: dict[str, Any] = dict(zip(names, map(Path, paths), strict=True))
+                return dataclasses.replace(config, **located)
     return config
 
 
 def _split(config: SeededScanNetppDataParserConfig) -> tuple[dict[str, Any], set[str]]:
     """The content of the transforms file with all photos either in ``frames`` or in ``test_frames``; and the names of
-    hidden photos, those of official tests, of which only the poses are published. Raises DataError if the file cannot
-    be used, or a training photo is missing."""
+    hidden photos, those of official tests. Raises DataError if the file, or a training photo, cannot be used."""
     path, photos = config.data / config.transforms_path, config.data / config.images_dir
     listed_in = path.parent.parent / "train_test_lists.json"
     expected = "expected JSON with frames, as ScanNet++ has it"
@@ -187,11 +172,8 @@ def _below(photos: Path, name: str) -> str:
 
 
 def _frame_of(folder: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
-    """The rigid motion (4, 4) from COLMAP's frame to that of poses, found from the photos that both know.
-
-    ``poses`` are camera-to-world (4, 4) in OpenGL axes by the name of the photo. Raises DataError if they know no photo
-    in common, or no motion takes all poses of the one to the other.
-    """
+    """The rigid motion (4, 4) from COLMAP's frame to that of ``poses``: camera-to-world (4, 4) in OpenGL axes, by the
+    name of the photo. Raises DataError if they know no photo in common, or no motion takes the ones to the others."""
     from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
     ours, theirs = [], []

@@ -9,18 +9,18 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
 import torch
 import yaml
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
+from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io.files import one_line, replacing
@@ -29,15 +29,13 @@ from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.memory import keep_freed_memory
-from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import fixed_threads, suitable_threads
 
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
 
 MOST_SKIPPED_IN_A_ROW = 10
-"""Number of steps in a row that may be skipped because their loss or gradients are not finite, before training stops
-and names their photos or scenes. One that is broken among sound ones stops nothing."""
+"""Number of steps in a row that may be skipped, before training stops and names their photos or scenes."""
 
 
 @dataclass
@@ -47,6 +45,12 @@ class StoppableTrainerConfig(TrainerConfig):
     threads: int | None = None
     """Number of threads of a training on a CPU. By default as many as other programs leave cores; the environment
     variable OMP_NUM_THREADS has the same effect as this. Another number may change results by rounding."""
+
+    # Settings of nerfstudio's that have no effect here: hidden on the command line.
+    mixed_precision: Suppress[Fixed[bool]] = False
+    use_grad_scaler: Suppress[Fixed[bool]] = False
+    gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
+    log_gradients: Suppress[Fixed[bool]] = False
 
     def save_config(self) -> None:
         """As nerfstudio's, but whole or not at all. Raises PointSplatError if it cannot be written, or no step is asked
@@ -70,17 +74,11 @@ class StoppableTrainerConfig(TrainerConfig):
 
 
 class StoppableTrainer(Trainer):
-    """nerfstudio's trainer. It reuses freed memory on a CPU.
+    """nerfstudio's trainer. On a CPU it reuses freed memory, and takes as many threads as other programs leave cores.
 
-    Steps on a CPU use as many threads as other programs leave cores
-    (:func:`~pointsplat_ns.system.threads.suitable_threads`).
-
-    Checkpoints and the config are written beside and renamed, so that one that is there is whole, however the training
-    ended.
-
-    Ctrl-C and SIGTERM end it after the step at hand, with a checkpoint of that step, and with the status of an
-    interrupted program: in the middle of densification, parameters are of different numbers. A second one ends it at
-    once.
+    Checkpoints and the config are written beside and renamed, so that one that is there is whole. Ctrl-C and SIGTERM
+    end it after the step at hand, with a checkpoint of that step, and with the status of an interrupted program: in the
+    middle of densification, parameters are of different numbers. A second one ends it at once.
 
     A step whose loss or gradients are not finite, in any process, changes neither parameters nor the optimisers' state
     nor buffers. It is counted, and the log names its photo or scene. The learning-rate schedules still advance.
@@ -112,12 +110,10 @@ class StoppableTrainer(Trainer):
         if self.local_rank == 0:
             # nerfstudio takes the steps of this call for the last step, also where a training resumes from a later one.
             writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
-        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-        self.callbacks.append(TrainingCallback(before, self._stop_if_asked, update_every_num_iters=1))
 
     def train(self) -> None:
         """As nerfstudio's, but Ctrl-C saves a checkpoint and ends ``ns-train`` with status 130. nerfstudio saves none
-        and ends with 0, as if it had finished. Raises PointSplatError if the number of threads is below 1."""
+        and ends with 0, as if it had finished."""
         with fixed_threads(self.config.threads), self._signals_noted():
             try:
                 super().train()
@@ -131,77 +127,59 @@ class StoppableTrainer(Trainer):
                 _interrupted(self._asked or signal.SIGINT)
 
     def _train_complete_viewer(self) -> None:
-        """Keep the viewer open after the last step until Ctrl-C or SIGTERM. The training is complete: they end it as
-        such, and need not come twice."""
+        """Keep the viewer open after the last step until Ctrl-C or SIGTERM, once: the training is complete."""
         with suppress(KeyboardInterrupt):
             if self._asked is None:
                 super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """One step, with the number of threads that suits it."""
+        """The loss, its parts, and numbers for the log, as nerfstudio's, which cannot skip a step. Raises DataError
+        after more than :data:`MOST_SKIPPED_IN_A_ROW` skipped steps, and KeyboardInterrupt if the training was asked to
+        stop."""
+        if self._asked is not None:
+            self._between_steps = True
+            raise KeyboardInterrupt
         with suitable_threads(torch.device(self.device)):
-            return self.one_step(step)
-
-    def one_step(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """The loss, its parts, and numbers for the log, as nerfstudio's ``train_iteration``, which cannot skip a step.
-
-        With a gradient scaler (``--mixed-precision``), the scaler handles gradients that overflow. If more than
-        :data:`MOST_SKIPPED_IN_A_ROW` steps were skipped, a checkpoint is saved, and a DataError ends the training.
-        """
-        pipeline, every = self.pipeline, self.gradient_accumulation_steps
-        buffers = [(buffer, buffer.clone()) for buffer in pipeline.model.buffers()]
-        names = list(self.optimizers.parameters)
-        self.optimizers.zero_grad_some([name for name in names if step % every[name] == 0])
-        device_type = self.device.split(":")[0]
-        with torch.autocast(device_type="cpu" if device_type == "mps" else device_type, enabled=self.mixed_precision):
-            _, losses, metrics = pipeline.get_train_loss_dict(step=step)
-            loss = functools.reduce(torch.add, losses.values())
-        faults = [f"the loss {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
-        skip = processes.any_rank(bool(faults), self.device)
-        if not skip:
-            self.grad_scaler.scale(loss).backward()
-            if not self.grad_scaler.is_enabled():
-                bad = [name for name in names if not all_finite(p.grad for p in self._trained(name))]
-                faults = [f"the gradient of the {name} is not finite" for name in bad]
-            skip = processes.any_rank(bool(faults), self.device)
-        if skip:
+            buffers = [(buffer, buffer.clone()) for buffer in self.pipeline.model.buffers()]
             self.optimizers.zero_grad_all()
-            with torch.no_grad():
-                for buffer, before in buffers:
-                    buffer.copy_(before)
-            self._count(step, self.source_of(metrics), faults)
-        self.update(step, [] if skip else [name for name in names if step % every[name] == every[name] - 1], skip)
-        metrics["skipped_steps"] = self.skipped.total()
-        if self.config.log_gradients:
-            norms = {n: p.grad.norm() for n, p in pipeline.model.named_parameters() if p.grad is not None}
-            metrics |= {f"Gradients/{name}": norm for name, norm in norms.items()}
-            metrics["Gradients/Total"] = sum(norms.values(), torch.zeros((), **FLOATS))
-        self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
-        if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
-            self.save_checkpoint(step)
-            sources = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
-            raise DataError(
-                f"training stopped at step {step}: losses or gradients were not finite in the last "
-                f"{self._skipped_in_a_row} steps, which were skipped ({sources}); mend or leave out what is named, or "
-                f"lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
-            )
-        return loss, losses, metrics
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)
+            loss = functools.reduce(torch.add, losses.values())
+            faults = [f"the loss {name} is {value.item():g}" for name, value in losses.items() if not value.isfinite()]
+            skip = processes.any_rank(bool(faults), self.device)
+            if not skip:
+                loss.backward()
+                bad = [name for name in self.optimizers.optimizers if not all_finite(self._trained(name))]
+                faults = [f"the gradient of the {name} is not finite" for name in bad]
+                skip = processes.any_rank(bool(faults), self.device)
+            if skip:
+                self.optimizers.zero_grad_all()
+                with torch.no_grad():
+                    for buffer, before in buffers:
+                        buffer.copy_(before)
+                self._count(step, self.source_of(metrics), faults)
+            self.update(step, skip)
+            self._skipped_in_a_row = self._skipped_in_a_row + 1 if skip else 0
+            if self._skipped_in_a_row > MOST_SKIPPED_IN_A_ROW:
+                self.save_checkpoint(step)
+                sources = ", ".join(f"{name}: {count}" for name, count in self.skipped.most_common(5))
+                raise DataError(
+                    f"training stopped at step {step}: losses or gradients were not finite in the last "
+                    f"{self._skipped_in_a_row} steps, which were skipped ({sources}); mend or leave out what is named, "
+                    f"or lower the learning rates; then go on with --load-dir {self.checkpoint_dir}"
+                )
+            return loss, losses, {**metrics, "skipped_steps": self.skipped.total()}
 
-    def update(self, step: int, names: list[str], skipped: bool) -> None:
-        """Step the optimisers of these groups by gradients averaged over processes, and all schedules."""
-        scale = self.grad_scaler.get_scale()
+    def update(self, step: int, skipped: bool) -> None:
+        """Step the optimisers, by gradients averaged over processes, unless the step is skipped; and all schedules."""
         if not skipped:
-            for name in names:
+            for name in self.optimizers.optimizers:
                 processes.average_gradients(self._trained(name))
-            self.clip(names)
-            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, names)
-            self.grad_scaler.update()
-        if scale <= self.grad_scaler.get_scale():  # as in nerfstudio: not if the scaler skipped the update
-            self.optimizers.scheduler_step_all(step)
+            self.clip()
+            self.optimizers.optimizer_step_all()
+        self.optimizers.scheduler_step_all(step)
 
-    def clip(self, names: list[str]) -> None:
-        """Limit the gradients of these groups together, before each optimiser limits those of its own group; by default
-        they are left alone."""
+    def clip(self) -> None:
+        """Limit all gradients together, before each optimiser limits its own; by default they are left alone."""
 
     def _trained(self, group: str) -> list[nn.Parameter]:
         """Parameters of a group: its optimiser has them, also where densification renews them."""
@@ -250,10 +228,8 @@ class StoppableTrainer(Trainer):
 
     @contextmanager
     def _signals_noted(self) -> Iterator[None]:
-        """While this is open, signals that would end the program end the training after its step.
-
-        Not where several processes train together: they save together, and one of them cannot stop alone.
-        """
+        """While this is open, signals that would end the program end the training after its step. Not where several
+        processes train together: they save together, and one of them cannot stop alone."""
         before = {}
         if threading.current_thread() is threading.main_thread() and self.world_size == 1:
             for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
@@ -273,20 +249,12 @@ class StoppableTrainer(Trainer):
             raise KeyboardInterrupt
         print("stopping after this step; once more to stop at once, without saving it", file=sys.stderr)
 
-    def _stop_if_asked(self, step: int) -> None:
-        """Called before each step."""
-        if self._asked is not None:
-            self._between_steps = True
-            raise KeyboardInterrupt
 
-
-def all_finite(tensors: Any) -> bool:
-    """Whether all numbers of tensors are finite; None counts as such.
-
-    A sum is not finite if a number is not, and is a fifth of the work; where it overflows, each number is checked.
-    """
-    there = (tensor for tensor in tensors if tensor is not None)
-    return all(bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all()) for tensor in there)
+def all_finite(parameters: list[nn.Parameter]) -> bool:
+    """Whether all gradients are finite. A sum is not if a number is not, and is a fifth of the work; where it
+    overflows, each number is checked."""
+    gradients = (p.grad for p in parameters if p.grad is not None)
+    return all(bool(gradient.sum().isfinite()) or bool(gradient.isfinite().all()) for gradient in gradients)
 
 
 def _interrupted(number: int) -> NoReturn:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -132,3 +133,10 @@ def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         chosen.most, chosen.fixed = outer, False
+
+
+def now(device: torch.device) -> float:
+    """Seconds since any moment, once the device has done its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pointsplat_ns.comparing.sizes import parse_resolution, size_text
 from pointsplat_ns.compression.compact import compact_scene
@@ -77,8 +77,7 @@ def subject_at(
     training: bool,
 ) -> Subject:
     """The scene at a path, with the options on views that its commands repeat; ``photos`` is a folder of photos. With
-    ``training``, photos are also trained on. Errors are those of
-    :func:`~pointsplat_ns.photos.posed_photos.read_with_photos`, or say that the path is no run with photos."""
+    ``training``, photos are also trained on. Raises a PointSplatError if there are none."""
     size, upward, sampled = parse_resolution(resolution), up_named(up), without_poses(poses)
     held_out: Callable[[], Photos] | None = None
     trained: Photos | None = None
@@ -105,18 +104,10 @@ def subject_at(
     return Subject(dense, path, new_views, held_out, trained, tuple(words), size, photos)
 
 
-class MadeScene(NamedTuple):
-    """A smaller scene, and the cost of making it."""
-
-    scene: Gaussians
-    seconds: float
-
-
-def make(subject: Subject, setting: Setting, progress: Progress) -> MadeScene:
-    """Make the scene of a setting, from a new source of views, so that time and result equal the command's. Raises
-    KeyboardInterrupt on Ctrl-C, also during a repair."""
-    dense, views = subject.dense, subject.new_views()
-    start = time.perf_counter()
+def make(subject: Subject, setting: Setting, progress: Progress) -> tuple[Gaussians, float]:
+    """The scene of a setting, and the seconds that it took: from a new source of views, so that time and result equal
+    the command's. Raises KeyboardInterrupt on Ctrl-C, also during a repair."""
+    dense, views, start = subject.dense, subject.new_views(), time.perf_counter()
     if setting.repair == "none":
         scene = prune_scene(dense, PruneRequest(setting.count, setting.by), views, progress).scene
     else:
@@ -126,4 +117,4 @@ def make(subject: Subject, setting: Setting, progress: Progress) -> MadeScene:
         if compacted.interrupted:
             raise KeyboardInterrupt
         scene = compacted.scene
-    return MadeScene(scene.to(dense.device), time.perf_counter() - start)
+    return scene.to(dense.device), time.perf_counter() - start

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import platform
 import re
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
@@ -30,8 +29,8 @@ from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.threads import fixed_threads
-from pointsplat_ns.tradeoff.making import MadeScene, Subject
+from pointsplat_ns.system.threads import fixed_threads, now
+from pointsplat_ns.tradeoff.making import Subject
 from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
 from pointsplat_ns.views import View, Views, spread_indices
 
@@ -40,13 +39,12 @@ ROUNDS = 3
 
 
 class JudgedViews(NamedTuple):
-    """The views that scenes are drawn and timed in, and compared with photos."""
+    """The views that scenes are drawn and timed in, their photos of the same size in [0, 1], if there are some, and a
+    text on their origin."""
 
     views: Views
     photos: list[Example] | None
-    """The photo of each view, of its size, in [0, 1]; None where there are none."""
     origin: str
-    """Text on the origin of the views."""
 
 
 def views_to_judge(subject: Subject, count: int) -> tuple[JudgedViews, str]:
@@ -97,16 +95,8 @@ def _averaged(photo: Example, view: View) -> Example:
 
 class Measurer:
     """Judges scenes as every command does, and measures them in the same views: frame times, and errors against photos
-    if there are some.
-
-    Args:
-        subject: the scene.
-        views: largest number of views that are timed, and of photos.
-
-    Raises:
-        SceneError: if no Gaussian can be drawn.
-        DataError: if there are no views, or they are too small for SSIM.
-    """
+    if there are some. ``views`` is the largest number of views that are timed, and of photos. Raises SceneError if no
+    Gaussian can be drawn; DataError if there are no views, or they are too small for SSIM."""
 
     def __init__(self, subject: Subject, views: int):
         need_usable(subject.dense)
@@ -119,11 +109,11 @@ class Measurer:
         if min(shown.width, shown.height) < SSIM_WINDOW:
             raise DataError(f"views are {shown.width} x {shown.height} pixels; expected at least {SSIM_WINDOW} a side")
 
-    def point(self, setting: Setting, made: MadeScene, show: Progress) -> Point:
-        """The point of a setting and its scene; the dense scene comes first. ``show`` is called with the name of the
-        current task and its share done."""
+    def point(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> Point:
+        """The point of a setting, from its scene and the seconds of making it; the dense scene comes first. ``show`` is
+        called with the name of the current task and its share done."""
         show("comparing", 0.0)
-        scene, quality = made.scene, self.judge.quality(made.scene)
+        quality = self.judge.quality(scene)
         assert quality.ssim is not None
         against_photos = self._against_photos(scene)
         speed, others_cores = self._speed(scene, show)
@@ -142,7 +132,7 @@ class Measurer:
             speed=speed,
             frame_ms=self._dense_ms / speed.median,
             fill=quality.fill,
-            seconds=made.seconds,
+            seconds=seconds,
             others_cores=others_cores,
         )
 
@@ -174,17 +164,9 @@ class Measurer:
 
 def _timed(scene: Gaussians, view: View) -> float:
     """Seconds of drawing a view."""
-    _wait_for(scene.device)
-    start = time.perf_counter()
+    start = now(scene.device)
     render(scene, view)
-    _wait_for(scene.device)
-    return time.perf_counter() - start
-
-
-def _wait_for(device: torch.device) -> None:
-    """Wait until a GPU is idle."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    return now(scene.device) - start
 
 
 def machine_text(device: torch.device) -> str:

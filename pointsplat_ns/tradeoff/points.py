@@ -11,8 +11,7 @@ from pointsplat_ns.compression.repair import Effort
 from pointsplat_ns.io.files import write_json
 
 Repair = Literal["none", "quick", "thorough", "photos"]
-"""Kinds of repair: none; the repair of ``compact`` of an effort; the effort ``quick``, and then a training on the
-photos."""
+"""Kinds of repair: none, those of ``compact`` by effort, and ``quick`` with a training on the photos after it."""
 
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
@@ -28,10 +27,9 @@ RESULTS = {"json": "tradeoff.json", "page": "tradeoff.html"}
 
 @dataclass(frozen=True)
 class Setting:
-    """A way of making a scene smaller."""
+    """A way of making a scene smaller: the number of Gaussians kept, a repair, and a method."""
 
     count: int
-    """Number of Gaussians kept."""
     repair: Repair = "none"
     by: str = "merge"
 
@@ -78,8 +76,8 @@ class Point:
     """Quality against held-out photos; None where there are none."""
     speed: Speed
     frame_ms: float
-    """Time of one frame, in milliseconds: the dense scene's time at the start, divided by the median speed. Each frame
-    is drawn in turn with one of the dense scene, so that points are comparable when the machine gets slower."""
+    """Milliseconds of a frame: the dense scene's at the start, divided by the median speed, so that points are
+    comparable when the machine gets slower."""
     fill: float
     """Mean number of Gaussians that viewers draw on a pixel."""
     seconds: float

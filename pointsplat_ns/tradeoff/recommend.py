@@ -17,29 +17,13 @@ PHOTO_PSNR = 27.0
 """Assumed PSNR in dB of a trained scene against held-out photos: about that of 3DGS on the captures of papers."""
 
 
-def fastest_first(points: Sequence[Point], trusted: bool = True) -> list[Point]:
-    """The points sorted by time of a frame, then number of Gaussians, then size of the file; times that are not
-    ``trusted`` are ignored."""
-    return sorted(points, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
-
-
 def expected_loss(psnr: float) -> float:
-    """The loss against photos, dB, of a scene whose renders have a PSNR (dB) against the dense scene's.
-
-    Example:
-        >>> expected_loss(float("inf")), round(expected_loss(27.0), 2), round(expected_loss(36.14), 2)
-        (0.0, 3.01, 0.5)
-    """
+    """The loss against photos, dB, of a scene whose renders have a PSNR (dB) against the dense scene's."""
     return 10 * math.log10(1 + 10 ** ((PHOTO_PSNR - psnr) / 10))
 
 
 def psnr_within(loss: float) -> float:
-    """The PSNR against the dense scene's renders, dB, at which a loss (dB, above 0) is expected.
-
-    Example:
-        >>> round(psnr_within(0.5), 1), round(psnr_within(1.0), 1)
-        (36.1, 32.9)
-    """
+    """The PSNR against the dense scene's renders, dB, at which a loss (dB, above 0) is expected."""
     return PHOTO_PSNR - 10 * math.log10(10 ** (loss / 10) - 1)
 
 
@@ -56,15 +40,17 @@ def next_best(points: Sequence[Point]) -> Point | None:
 
 
 def fastest_within(points: Sequence[Point], loss: float, trusted: bool = True) -> Point:
-    """The fastest point that loses at most ``loss`` dB. The first point is the dense scene, which loses nothing.
-    ``trusted`` as for :func:`fastest_first`."""
+    """The fastest point that loses at most ``loss`` dB; of those as fast the one with the fewest Gaussians, then the
+    smallest file. The first point is the dense scene, which loses nothing. Times that are not ``trusted`` are
+    ignored."""
     # 1e-9, because differences of decimal numbers are not exact: 30.1 - 29.6 is more than 0.5.
-    return next(p for p in fastest_first(points, trusted) if loss_of(p, points[0]) <= loss + 1e-9)
+    enough = [point for point in points if loss_of(point, points[0]) <= loss + 1e-9]
+    return min(enough, key=lambda point: (point.frame_ms if trusted else 0.0, point.gaussians, point.bytes))
 
 
 def recommend(points: Sequence[Point], within: float, trusted: bool = True) -> tuple[Point, str]:
-    """The fastest point that loses at most ``within`` dB, and a text on it. The first point is the dense scene; if it
-    is the fastest, the text has the figures of the best of the others too. ``trusted`` as for :func:`fastest_first`."""
+    """As :func:`fastest_within`, with a text on the point. If it is the dense scene, the text has the figures of the
+    best of the others too."""
     dense = points[0]
     best, other = fastest_within(points, within, trusted), next_best(points)
     if dense.against_photos is not None:

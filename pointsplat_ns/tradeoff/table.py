@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from pointsplat_ns.compression.quality import decibels
+from pointsplat_ns.compression.quality import decibels, word_for
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import bytes_text, need_folder
+from pointsplat_ns.io.files import bytes_text, need_folder, replacing, three_digits
 from pointsplat_ns.io.runs import name_of
 from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
+from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import picture_uri, to_uint8
 from pointsplat_ns.pruning import Keep, method_named, parse_keep, resolve_keep
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
-from pointsplat_ns.tradeoff.making import MadeScene, make, subject_at
+from pointsplat_ns.tradeoff.making import make, subject_at
 from pointsplat_ns.tradeoff.measuring import Measurer, busy_note, machine_text
-from pointsplat_ns.tradeoff.points import DENSE, REPAIRS, RESULTS, Point, Setting, Tradeoff, write_points
-from pointsplat_ns.tradeoff.recommend import recommend
+from pointsplat_ns.tradeoff.points import (
+    DENSE,
+    REPAIRS,
+    RESULTS,
+    ImageMetrics,
+    Point,
+    Setting,
+    Tradeoff,
+    write_points,
+)
+from pointsplat_ns.tradeoff.recommend import next_best, recommend
 from pointsplat_ns.views import spread_indices
-
-logger = logging.getLogger("pointsplat_ns")
-
-KEEP = ("70%", "50%", "30%", "20%", "10%", "5%")
-"""Budgets of a table, unless others are named."""
-
-PICTURED = 6
-"""Largest number of views with pictures."""
 
 
 @normal_mode
@@ -42,7 +44,7 @@ def measure_tradeoff(
     scene: str | Path,
     folder: str | Path,
     *,
-    keep: Sequence[Keep | str] = KEEP,
+    keep: Sequence[Keep | str] = ("70%", "50%", "30%", "20%", "10%", "5%"),
     within: float = 0.5,
     by: Sequence[str] = ("merge",),
     repairs: Sequence[str] = ("none", "quick"),
@@ -116,9 +118,8 @@ def measure_tradeoff(
                 def show(what: str, share: float, name: str = f"point {number} of {len(table)}") -> None:
                     report(f"{name}: {what}", share)
 
-                dense = setting.by == DENSE
-                made = MadeScene(subject.dense, 0.0) if dense else make(subject, setting, show)
-                measuring.add(setting, made, show)
+                made = (subject.dense, 0.0) if setting.by == DENSE else make(subject, setting, show)
+                measuring.add(setting, *made, show)
         except (KeyboardInterrupt, SystemExit):
             if measuring.points:
                 measuring.write("the measurement was interrupted")
@@ -129,7 +130,7 @@ def measure_tradeoff(
 def check_options(
     keep: Sequence[Keep | str], by: Sequence[str], repairs: Sequence[str], within: float, views: int
 ) -> None:
-    """Raise a PointSplatError if an option is invalid."""
+    """Raise a PointSplatError if an option means nothing."""
     if not 0 < within < math.inf:
         raise PointSplatError(f"a loss of {within:g} dB; expected a positive number, such as 0.5")
     if views < 1:
@@ -148,8 +149,7 @@ def check_options(
 def settings_of(
     dense: Gaussians, keep: Sequence[Keep | str], by: Sequence[str], repairs: Sequence[str]
 ) -> list[Setting]:
-    """The dense scene, and all combinations of options, each once, the largest first. Raises BudgetError if a budget
-    does not fit the scene."""
+    """The dense scene, and all combinations of options, each once, the largest first."""
     counts = {resolve_keep(len(dense), budget, dense.sh_degree, dense.traits) for budget in keep}
     ordered = [repair for repair in REPAIRS if repair in repairs]
     ways = itertools.product(sorted(counts, reverse=True), ordered, dict.fromkeys(by))
@@ -162,7 +162,7 @@ class _Measuring:
     def __init__(self, measurer: Measurer, within: float, folder: Path):
         self.measurer, self.within, self.folder = measurer, within, folder
         self.points: list[Point] = []
-        self.shown = spread_indices(len(measurer.judged.views), PICTURED)
+        self.shown = spread_indices(len(measurer.judged.views), 6)  # views with pictures
         photos = measurer.judged.photos
         self.pictures: list[dict[str, str]] = [
             {} if photos is None else {"photo": picture_uri(to_uint8(photos[index].target))} for index in self.shown
@@ -170,20 +170,15 @@ class _Measuring:
         """For each view, pictures for the page: the photo, and that of each point by its key."""
 
     @torch.no_grad()
-    def add(self, setting: Setting, made: MadeScene, show: Progress) -> None:
+    def add(self, setting: Setting, scene: Gaussians, seconds: float, show: Progress) -> None:
         """Measure a scene, and draw it."""
-        point = self.measurer.point(setting, made, show)
+        point = self.measurer.point(setting, scene, seconds, show)
         for pictures, index in zip(self.pictures, self.shown, strict=True):
-            pictures[point.key] = picture_uri(to_uint8(render(made.scene, self.measurer.judged.views[index])))
+            pictures[point.key] = picture_uri(to_uint8(render(scene, self.measurer.judged.views[index])))
         self.points.append(point)
-        figures = [] if point.against_photos is None else [f"{point.against_photos.psnr:.1f} dB against photos"]
-        figures += [] if setting.by == DENSE else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
-        logger.info("%s: %s", point.label, ", ".join([*figures, bytes_text(point.bytes)]))
 
     def write(self, note: str = "") -> Tradeoff:
         """Write and return the results so far."""
-        from pointsplat_ns.tradeoff.page import write_page
-
         measurer, busy = self.measurer, busy_note([point.others_cores for point in self.points])
         best, why = recommend(self.points, self.within, trusted=not busy)
         found = Tradeoff(
@@ -201,3 +196,42 @@ class _Measuring:
         write_points(found, self.folder)
         write_page(found, self.pictures, self.folder / RESULTS["page"])
         return found
+
+
+def write_page(found: Tradeoff, pictures: Sequence[dict[str, str]], output: Path) -> None:
+    """Write one HTML file with the points of a scene, which needs no other file. ``pictures`` are, for each view, data
+    URIs of the picture of each point by its key, and of the photo as ``photo``."""
+    dense, best = found.points[0], found.point(found.recommended)
+    shown = next_best(found.points) or best if best is dense else best
+    data = {"points": [_data(point) for point in found.points], "pictures": list(pictures), "shown": shown.key}
+    html = page(
+        "tradeoff.html", ("tradeoff.js",), found=found, photos=dense.against_photos is not None,
+        shown=shown, word_for=word_for, three_digits=three_digits, infinity=math.inf, data=data,
+    )  # fmt: skip
+    with replacing(output) as part:
+        part.write_bytes(html)
+
+
+def _data(point: Point) -> dict[str, Any]:
+    """Data of a point for the scripts; None for what was not measured, or differs in nothing."""
+
+    def finite(quality: ImageMetrics | None) -> dict[str, float | None]:
+        psnr = None if quality is None or quality.psnr == math.inf else quality.psnr
+        return {"psnr": psnr, "ssim": None if psnr is None or quality is None else quality.ssim}
+
+    figures = [] if point.against_photos is None else [f"{point.against_photos.psnr:.1f} dB against photos"]
+    figures += [] if point.by == "dense" else [f"{decibels(point.against_dense.psnr)} against the dense scene"]
+    figures += [f"{point.speed.median:.2g} times as fast", f"{point.gaussians:,} Gaussians", bytes_text(point.bytes)]
+    repaired = "" if point.repair == "none" else f", repaired ({point.repair})"
+    return {
+        "key": point.key,
+        "label": point.label,
+        "command": point.command,
+        "group": f"{point.by}{repaired}",
+        "figures": ", ".join(figures),
+        "frame_ms": point.frame_ms,
+        "gaussians": point.gaussians,
+        "megabytes": point.bytes / 1e6,
+        "renders": finite(point.against_dense),
+        "photos": finite(point.against_photos),
+    }

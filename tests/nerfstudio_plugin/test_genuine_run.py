@@ -10,7 +10,7 @@ import pointsplat_ns as ps
 from making import SHARED_DATA
 from pointsplat_ns.io.pictures import in_unit_range
 from pointsplat_ns.io.runs import open_run
-from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views, run_photos
+from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos
 
 RUN = SHARED_DATA / "splatfacto" / "fox" / "splatfacto" / "2026-11-26_gsplat"
 CAPTURE = SHARED_DATA / "scannetpp" / "fox"
@@ -38,9 +38,8 @@ def test_its_checkpoint_is_read_to_the_bit(run):
 
 
 def test_its_renders_show_its_held_out_photos(run):
-    photos = run_photos(run, "test")
-    assert len(photos) == 5 and len(dataset_views(run)) == 45
-    scene = ps.load(run)
+    photos, scene = run_photos(run, "test"), ps.load(run)
+    assert len(photos) == 5 and len(ps.dataset_views(run)) == 45
     grey = [ps.render(scene, photo.view).mean(dim=-1).flatten() for photo in photos]
     seen = [in_unit_range(photo.target).mean(dim=-1).flatten() for photo in photos]
     alike = torch.corrcoef(torch.stack([*grey, *seen]))[:5, 5:]

@@ -25,28 +25,20 @@ def parse(folder, split="train", **options):
     return ReplicaDataParserConfig(data=folder, **options).setup().get_dataparser_outputs(split)
 
 
-def numbers(folder, split="train", **options):
-    return [int(path.stem[5:]) for path in parse(folder, split, **options).image_filenames]
-
-
 def test_frames_are_held_out_by_step(row):
-    assert numbers(row, "val") == numbers(row, "test") == [0, 10]
-    assert numbers(row) == [1, 2, 3, 4, 5, 6, 7, 8, 9, 11]
-    assert numbers(row, "val", frame_stride=2, eval_every=3) == [0, 6]
-    assert numbers(row, frame_stride=2, eval_every=3) == [2, 4, 8, 10]
+    def numbers(split, **options):
+        return [int(path.stem[5:]) for path in parse(row, split, **options).image_filenames]
 
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"eval_every": 1}, "--eval-every 1"),
-        ({"frame_stride": 0}, "--frame-stride 0"),
+    assert numbers("val") == numbers("test") == [0, 10]
+    assert numbers("train") == [1, 2, 3, 4, 5, 6, 7, 8, 9, 11]
+    assert numbers("val", frame_stride=2, eval_every=3) == [0, 6]
+    assert numbers("train", frame_stride=2, eval_every=3) == [2, 4, 8, 10]
+    for options, words in (
+        ({"eval_every": 1}, "--eval-every 1"), ({"frame_stride": 0}, "--frame-stride 0"),
         ({"frame_stride": 12}, "leave 0 for training"),
-    ],
-)
-def test_options_that_cannot_work_are_refused_in_one_line(row, options, words):
-    with pytest.raises(DataError, match=words):
-        parse(row, **options)
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=words):
+            parse(row, **options)
 
 
 def test_cameras_follow_nerfstudio_axes_and_pixel_centres(row):
@@ -104,23 +96,14 @@ def test_a_whole_scene_is_read_as_written(scene):
     assert load_replica(scene).depths is None
 
 
-@pytest.mark.parametrize(
-    ("camera", "expected"),
-    [
+def test_the_convention_of_pixel_centres_is_told_by_the_principal_point(tmp_path):
+    for number, (camera, expected) in enumerate((
         ({}, (4.0, 3.0)),  # 3.5 of 8: Replica's own way, counted from the first pixel's centre
         ({"cx": 4.0, "cy": 3.0}, (4.0, 3.0)),  # exactly half: counted from the corner
         ({"cx": 3.9, "cy": 3.0}, (4.4, 3.5)),  # a calibration: OpenCV's integer centres
-    ],
-)
-def test_the_convention_of_pixel_centres_is_told_by_the_principal_point(tmp_path, camera, expected):
-    params = load_replica(write_scene(tmp_path / "s", camera={**CAMERA, **camera})).params
-    assert params.principal_point == pytest.approx(expected)
-
-
-def one_deeper(scene: Path) -> None:
-    moved = scene.rename(scene.with_name("moved"))
-    scene.mkdir()
-    moved.rename(scene / "t")
+    )):  # fmt: skip
+        params = load_replica(write_scene(tmp_path / str(number), camera={**CAMERA, **camera})).params
+        assert params.principal_point == pytest.approx(expected)
 
 
 def removed(name: str):
@@ -144,14 +127,12 @@ COLUMN_BY_COLUMN[3, :3] = 1, 2, 3
     ("spoil", "words"),
     [
         (lambda scene: scene.rename(scene.with_name("none")), ["no traj.txt or traj_w_c.txt"]),
-        (one_deeper, ["contains the scenes t: name one"]),
         (removed("cam_params.json"), ["s/cam_params.json", "rooms/cam_params.json"]),
         (removed("results/frame000002.png"), ["4 poses for 3 photos"]),
         (camera("{"), ["JSONDecodeError", "cam_params.json"]),
         (camera("{}"), ["KeyError: 'camera'; expected {\"camera\""]),
         (camera({"fx": 10**400}), ["OverflowError: "]),
         (camera({"fx": -1.0}), ["'fx': -1.0", "with positive numbers"]),
-        (camera({"scale": float("nan")}), ["'scale': nan"]),
         (camera({"cy": float("inf")}), ["'cy': inf"]),
         (camera({"h": 6.5}), ["'h': 6.5", "whole ones of pixels"]),
         (line(3, " ".join(["0"] * 15)), ["line 3: 15 values"]),
@@ -179,13 +160,11 @@ def test_pictures_of_another_kind_or_size_and_broken_ones_are_refused(scene):
         with pytest.raises(DataError, match=message):
             read_photo(photo, loaded.params)
     depth = loaded.depths[1]
+    depth.write_bytes(depth.read_bytes()[:-30])
+    with pytest.raises(DataError, match="broken picture"):
+        read_depth(depth, loaded.params)
     Image.new("L", (8, 6)).save(depth)
     with pytest.raises(DataError, match="expected a 16-bit grey"):
-        read_depth(depth, loaded.params)
-    noise = np.random.default_rng(0).integers(0, 65535, (6, 8)).astype(np.uint16)
-    Image.fromarray(noise).save(depth)
-    depth.write_bytes(depth.read_bytes()[:-40])
-    with pytest.raises(DataError, match="broken picture"):
         read_depth(depth, loaded.params)
 
 
@@ -199,8 +178,7 @@ def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
     assert len(xyz) == 6 * 6 - 3 and set(np.unique(xyz[:, 2])) == {1.0, 3.0}
 
 
-@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 -1e300 0 1 0 0 0 0 1 0 0 0 0 1",
-                                  "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])  # fmt: skip
+@pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])
 def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(scene, caplog, lost):
     edit_line(scene, 2, lost)
     with caplog.at_level(logging.WARNING):
@@ -222,15 +200,12 @@ def test_sequences_of_semantic_nerf_are_read_as_the_same_scene(row, tmp_path):
         Image.fromarray(values).save(sequence / "depth" / f"depth_{number}.png")
     (sequence / "traj_w_c.txt").write_bytes((row / "traj.txt").read_bytes())
     theirs = load_replica(sequence)
-    width, height = theirs.params.width, theirs.params.height
     assert len(theirs) == len(ours) == 12 and np.array_equal(theirs.poses, ours.poses)
     assert [path.name for path in theirs.photos][9:] == ["rgb_9.png", "rgb_10.png", "rgb_11.png"]
-    assert theirs.params.fx == theirs.params.fy == width / 2
-    assert theirs.params.principal_point == (width / 2, height / 2)
-    both = read_depth(theirs.depths[3], theirs.params), read_depth(ours.depths[3], ours.params)
-    assert np.allclose(*both, atol=6e-4), "half a millimetre of rounding"
+    assert theirs.params.fx == theirs.params.fy == 4 and theirs.params.principal_point == (4, 3)
+    depths = [read_depth(each.depths[3], each.params) for each in (theirs, ours)]
+    assert np.allclose(*depths, atol=6e-4), "half a millimetre of rounding"
     assert np.array_equal(read_photo(theirs.photos[3], theirs.params), read_photo(ours.photos[3], ours.params))
-    assert len(parse(sequence).image_filenames) == 10 and len(parse(sequence, "test").image_filenames) == 2
     with pytest.raises(DataError, match="it contains the scenes Sequence_1: name one of them"):
         load_replica(sequence.parent)
     (sequence / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))

@@ -33,8 +33,7 @@ REFINER_RATES = {
 }
 """Adam's peak learning rate for each part of the network. The published 1e-5 to 3e-5 suit a long training of the full
 network. Merged scenes need little repair, and high rates overfit: after 300 steps on two rooms, a third room gained
-0.4 dB at 1e-4 and 0.1 dB at 2e-4. At 3e-4 and above (400 steps) it lost, although the two training rooms gained more at
-higher rates. Scenes pruned by the paper's score need more repair; there 1e-3 learns faster."""
+0.4 dB at 1e-4 and 0.1 dB at 2e-4, and lost at 3e-4. Scenes pruned by the paper's score learn faster at 1e-3."""
 
 
 @dataclass
@@ -55,14 +54,10 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     global_norm: float | None = None
     """Largest norm of all gradients together, in place of each optimiser's max-norm for its own part."""
 
-    # Settings of nerfstudio's that have no effect here: hidden on the command line.
-    gradient_accumulation_steps: Suppress[Fixed[dict[str, int]]] = field(default_factory=dict)
-    steps_per_eval_batch: Suppress[Fixed[int]] = 0
-    prompt: Suppress[Fixed[str | None]] = None
+    steps_per_eval_batch: Suppress[Fixed[int]] = 0  # nerfstudio's, without effect here
 
     def set_timestamp(self) -> None:
-        """As nerfstudio's; processes that ``torchrun`` started are connected here. Raises PointSplatError if nerfstudio
-        is to start several processes on a CPU, which it cannot."""
+        """As nerfstudio's; processes that ``torchrun`` started are connected here."""
         kind, number = self.machine.device_type, self.machine.num_devices
         if kind != "cuda" and number > 1:
             raise PointSplatError(
@@ -85,16 +80,13 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
     def setup(self, **kwargs) -> Trainer:
         """Build the trainer with a copy of this config whose rates and limits of gradients are set.
 
-        A resumed run ends ``max_num_iterations`` after the step that it resumes from, or when ``seconds`` are over, and
-        so do its schedules: a run stopped at 500 of 2,000 steps and resumed for 1,500 continues exactly as if it had
-        not been stopped.
+        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from, or when
+        ``seconds`` are over, as if it had not been stopped.
         """
-        if not 0 < self.rate_factor < math.inf:  # NaN fails too
-            raise PointSplatError(f"--rate-factor {self.rate_factor:g}: expected a finite number above 0")
-        if not 0 < self.drop_at < math.inf:
-            raise PointSplatError(f"--drop-at {self.drop_at:g}: expected a finite number above 0")
-        if self.global_norm is not None and not self.global_norm > 0:
-            raise PointSplatError(f"--global-norm {self.global_norm:g}: expected a number above 0")
+        for name in ("rate_factor", "drop_at", "seconds", "global_norm"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:  # NaN fails too
+                raise PointSplatError(f"--{name.replace('_', '-')} {value:g}: expected a finite number above 0")
         config = copy.deepcopy(self)
         if config.seconds is not None:
             config.max_num_iterations = sys.maxsize
@@ -108,6 +100,12 @@ class PointSplatTrainerConfig(StoppableTrainerConfig):
         return self._target(config, **kwargs)
 
 
+def adam(rates: dict[str, float], eps: float, max_norm: float | None = None) -> dict[str, dict]:
+    """Adam for each part of the network by its rate; the schedules are the trainer's own."""
+    optimizers = {name: FusedAdamConfig(lr=rate, eps=eps, max_norm=max_norm) for name, rate in rates.items()}
+    return {name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()}
+
+
 def pointsplat_config() -> PointSplatTrainerConfig:
     """The ``pointsplat`` method: 2,000 steps, which take two CPU cores less than an hour on small scenes."""
     return PointSplatTrainerConfig(
@@ -117,15 +115,8 @@ def pointsplat_config() -> PointSplatTrainerConfig:
         steps_per_save=500,
         steps_per_eval_image=100,
         steps_per_eval_all_images=0,
-        mixed_precision=False,
         pipeline=PointSplatPipelineConfig(),
-        optimizers={
-            name: {
-                "optimizer": FusedAdamConfig(lr=rate, eps=1e-15, max_norm=2.0),
-                "scheduler": None,  # the trainer's own
-            }
-            for name, rate in REFINER_RATES.items()
-        },
+        optimizers=adam(REFINER_RATES, eps=1e-15, max_norm=2.0),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="tensorboard",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,13 +12,13 @@ import torch
 from nerfstudio.data.datamanagers.base_datamanager import DataManager, DataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
-from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.errors import DataError, SceneError
-from pointsplat_ns.io.discovery import Supervision, shown_scene
+from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys, shown_scene
+from pointsplat_ns.io.runs import open_run
 from pointsplat_ns.nerfstudio_plugin.frames import Frame, Frames, MemoryCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import SampledPoses
-from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import training_scenes
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
+from pointsplat_ns.nerfstudio_plugin.pointsplat.scenes import TrainedScene
 
 
 @dataclass
@@ -48,19 +49,11 @@ class ScenesDataManagerConfig(DataManagerConfig):
     seed: int = 0
     """Determines the order of scenes and photos."""
 
-    # nerfstudio's settings that have no effect here: hidden on the command line.
-    masks_on_gpu: Suppress[Fixed[bool]] = False
-    images_on_gpu: Suppress[Fixed[bool]] = False
-
 
 class ScenesDataManager(DataManager):
-    """Hands out, at each step, one scene and some of its training photos.
-
-    The scene and photos of a step depend only on the seed and the step, so that a resumed training continues as if it
-    had not been stopped. Of W processes, process R takes the places R, W + R, 2 W + R... of one sequence: together they
-    see what one process sees in W times the steps. Raises SceneError if ``data`` holds no trained run, or
-    ``eval_scenes`` names one that is not there.
-    """
+    """Hands out, at each step, one scene and some of its training photos, by the seed and the step alone, so that a
+    resumed training continues as if it had not been stopped. Of W processes, process R takes the places R, W + R,
+    2 W + R... of one sequence: together they see what one process sees in W times the steps."""
 
     config: ScenesDataManagerConfig
 
@@ -84,17 +77,7 @@ class ScenesDataManager(DataManager):
             raise DataError(f"{config.sampled_poses} sampled poses of {size} pixels: expected at least 1 of 1 x 1")
         self._pixels = 0
         self.cache = MemoryCache.of(config.cache_gigabytes)
-        held_out_poses = max(1, config.sampled_poses // 5)
-        poses = SampledPoses(config.sampled_poses, held_out_poses, *config.sampled_size, seed=config.seed)
-        self.supervision, self.scenes = training_scenes(
-            Path(config.data),
-            config.supervision,
-            self.cache,
-            poses,
-            device,
-            need_data=test_mode != "inference",
-            data=config.scene_data,
-        )
+        self.supervision, self.scenes = self._found_scenes(Path(config.data))
         names = [scene.name for scene in self.scenes]
         unknown = [name for name in config.eval_scenes if name not in names]
         if unknown:
@@ -113,6 +96,47 @@ class ScenesDataManager(DataManager):
         CONSOLE.log(f"training scenes: {training}; trained on: {targets}; evaluation on: {held_out}")
         super().__init__()
 
+    def _found_scenes(self, folder: Path) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
+        """The kind of training targets, and the scenes that ``--data`` names. Raises SceneError if there is none, or
+        photos are needed and those of no run are found; DataError if a training fitted colours to each photo."""
+        config = self.config
+        runs, plys, nothing = find_runs_and_plys(folder, config.supervision)
+        if not runs and not plys:
+            if nothing is None:
+                found = "a PLY file, which has no photos" if config.supervision == "photos" else "no Gaussians in it"
+                found = found if folder.is_file() else "no such file"
+                wanted = "--pipeline.datamanager.supervision dense" if config.supervision == "photos" else "a 3DGS .ply"
+                raise SceneError(f"{folder}: {found}; expected {wanted}")
+            hint = " (PLY files are trained on with --pipeline.datamanager.supervision dense)"
+            hint = hint if config.supervision == "photos" else ", or 3DGS PLY files"
+            raise SceneError(f"{nothing}{hint}") from nothing
+        chosen: Literal["photos", "dense"] = "dense" if plys or config.supervision == "dense" else "photos"
+        scenes: list[DenseScene] = []
+        missing: list[str] = []
+        for name, run in runs.items():
+            has_photos = True
+            if self.test_mode != "inference":
+                try:
+                    run = dataclasses.replace(run, data=open_run(run.config_path, data=config.scene_data).data)
+                except SceneError:
+                    has_photos = False
+                    missing.append(f"{run.config_path}: its data {run.data} is not there")
+                    what = "left out" if chosen == "photos" else "seen from sampled poses"
+                    CONSOLE.log(f"{name} is {what}: {missing[-1]}")
+            scene = TrainedScene(name, run, self.cache, config, self.device, has_photos)
+            if has_photos and chosen == "photos" and self.test_mode != "inference":
+                scene.need_photos_as_rendered("take --pipeline.datamanager.supervision dense")
+            if has_photos or chosen == "dense":
+                scenes.append(scene)
+        scenes += [DenseScene(name, path, self.cache, config, self.device) for name, path in plys.items()]
+        if not scenes:
+            others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""
+            raise SceneError(
+                f"{missing[0]}{others}; name the folder where it is now (--pipeline.datamanager.scene-data DIR), or "
+                "take --pipeline.datamanager.supervision dense"
+            )
+        return chosen, scenes
+
     @property
     def train_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Training photos of the shown scene, for the viewer."""
@@ -121,7 +145,7 @@ class ScenesDataManager(DataManager):
     @property
     def eval_dataset(self) -> InputDataset | None:  # type: ignore[override]
         """Held-out photos of the shown scene, for the viewer."""
-        return None if self.test_mode == "inference" else self.scenes[self.shown].eval_frames.dataset
+        return None if self.test_mode == "inference" else self.scenes[self.shown].frames("test").dataset
 
     def setup_train(self) -> None:
         """Nothing: photos are read when they are needed."""
@@ -130,8 +154,8 @@ class ScenesDataManager(DataManager):
 
     def training_frames(self, scene: int) -> Frames:
         """The training targets of a scene: its photos, or the dense scene's own renders."""
-        scene_at = self.scenes[scene]
-        return scene_at.train_frames if self.supervision == "photos" else scene_at.rendered_train
+        found = self.scenes[scene]
+        return found.frames("train") if self.supervision == "photos" else found.rendered["train"]
 
     def place(self, step: int) -> int:
         """The place of this process in the common sequence of scenes, at one of its steps."""
@@ -155,15 +179,11 @@ class ScenesDataManager(DataManager):
         return scene, frames
 
     def next_eval_image(self, step: int) -> tuple[int, list[Frame]]:  # type: ignore[override]
-        """Index of an evaluation scene, and one of its held-out photos."""
+        """Index of an evaluation scene, and one of its held-out photos, if there is one."""
         scene = self.eval_indices[step % len(self.eval_indices)]
-        frames = self.scenes[scene].eval_frames
-        if len(frames) == 0:
-            raise DataError(
-                f"{self.scenes[scene].source}: no frame of its data is held out; change the dataparser's split"
-            )
-        index = random.Random(f"{self.config.seed} eval {step}").randrange(len(frames))
-        return scene, [frames[index]]
+        frames = self.scenes[scene].frames("test")
+        chosen = random.Random(f"{self.config.seed} eval {step}").randrange(max(1, len(frames)))
+        return scene, [frames[chosen]] if len(frames) > 0 else []
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the latest step, for nerfstudio's log."""

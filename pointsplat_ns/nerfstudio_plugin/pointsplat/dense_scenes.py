@@ -1,17 +1,12 @@
-"""Dense scenes whose own renders take the place of photos.
-
-They are rendered from the poses of the scene's dataset, or without a dataset from sampled poses. A folder
-of PLY files can thus be a training set.
-"""
+"""Dense scenes whose own renders, from sampled poses or those of a dataset, take the place of photos."""
 
 from __future__ import annotations
 
 import hashlib
 import random
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -29,19 +24,11 @@ from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.views import RasterizeMode
 
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
+
 Split = Literal["train", "test"]
 """The training photos of a dataset, or its held-out ones."""
-
-
-@dataclass(frozen=True)
-class SampledPoses:
-    """Numbers of poses to sample in a scene without a dataset, and their image size in pixels."""
-
-    train: int = 40
-    test: int = 8
-    width: int = 320
-    height: int = 240
-    seed: int = 0
 
 
 class DenseScene:
@@ -51,24 +38,30 @@ class DenseScene:
         name: unique among the scenes in use.
         source: the file that holds the Gaussians.
         cache: for Gaussians and renders, shared among scenes.
-        poses: how to sample poses if there is no dataset.
+        poses: how many poses are sampled if there is no dataset, their size and seed.
         device: where renders are computed.
     """
 
     has_photos = False
-    """Whether ``train_frames`` and ``eval_frames`` are photos; otherwise they are the scene's own renders."""
+    """Whether ``frames`` are photos; otherwise they are the scene's own renders."""
+    rasterize_mode: RasterizeMode = "classic"
+    """Rasterize mode that the scene is rendered with."""
 
     def __init__(
         self,
         name: str,
         source: Path,
         cache: MemoryCache,
-        poses: SampledPoses | None = None,
+        poses: ScenesDataManagerConfig | None = None,
         device: torch.device | str = "cpu",
     ):
-        self.name, self.source = name, source
-        self.cache, self._device = cache, device
-        self._poses = SampledPoses() if poses is None else poses
+        self.name, self.source, self.cache = name, source, cache
+        self._poses, self.device = poses, device
+        self.rendered: dict[Split, Frames] = {
+            "train": Frames(RenderedDataset(self, "train"), "uint8", cache, device),
+            "test": Frames(RenderedDataset(self, "test"), "float32", cache, device),
+        }
+        """Renders of the dense scene, in 8 bits as photos are from training poses, not rounded from held-out ones."""
 
     @cached_property
     def identity(self) -> str:
@@ -80,11 +73,6 @@ class DenseScene:
             stream.seek(max(0, size - read))
             content += stream.read()
         return f"{self.name}/ply {hashlib.sha256(content + str(size).encode()).hexdigest()[:16]}"
-
-    @property
-    def rasterize_mode(self) -> RasterizeMode:
-        """Rasterize mode that the scene is rendered with."""
-        return "classic"
 
     @property
     def background(self) -> Tensor:
@@ -106,46 +94,24 @@ class DenseScene:
         return dense
 
     def cameras(self, split: Split) -> Cameras:
-        """Pinhole cameras (C,) sampled, different ones for each split. Every second one of the training
-        split is subsampled from a picture of the size that people look at. Raises DataError, which names the file, if
-        nothing of the scene is visible."""
-        poses = self._poses
-        seed = random.Random(f"{poses.seed} poses {split}").getrandbits(31)
-        count = poses.train if split == "train" else poses.test
+        """Pinhole cameras (C,) sampled, different ones for each split: a fifth as many are held out. Every second one
+        of the training split is subsampled from a picture of the size that people look at. Raises DataError, which
+        names the file, if nothing of the scene is visible."""
+        assert self._poses is not None
+        size, count = self._poses.sampled_size, self._poses.sampled_poses
+        seed = random.Random(f"{self._poses.seed} poses {split}").getrandbits(31)
         try:
-            views = sample_views(self.dense(keep=True), count, poses.width, poses.height, seed)
+            views = sample_views(self.dense(keep=True), count if split == "train" else max(1, count // 5), *size, seed)
         except DataError as error:
             raise DataError(f"{self.source}: {error}") from error
-        cameras, side = cameras_of_views(views), max(poses.width, poses.height)
-        if split == "train" and side < max(RESOLUTION) and cameras.metadata is not None:
-            cameras.metadata["eps2d"][1::2] = subsampled(views, max(RESOLUTION), side).eps2d
+        cameras = cameras_of_views(views)
+        if split == "train" and max(size) < max(RESOLUTION) and cameras.metadata is not None:
+            cameras.metadata["eps2d"][1::2] = subsampled(views, max(RESOLUTION), max(size)).eps2d
         return cameras
 
-    @cached_property
-    def rendered_train(self) -> Frames:
-        """Renders of the dense scene from the training poses, in 8 bits as photos are."""
-        return Frames(RenderedDataset(self, "train"), "uint8", self.cache, self._device)
-
-    @cached_property
-    def rendered_eval(self) -> Frames:
-        """Renders of the dense scene from the held-out poses, not rounded."""
-        return Frames(RenderedDataset(self, "test"), "float32", self.cache, self._device)
-
-    @property
-    def train_frames(self) -> Frames:
-        """Training images: photos if the scene has them, else its own renders."""
-        return self.rendered_train
-
-    @property
-    def eval_frames(self) -> Frames:
-        """Held-out images: photos if the scene has them, else its own renders."""
-        return self.rendered_eval
-
-    @torch.no_grad()
-    def picture(self, camera: Cameras) -> Tensor:
-        """A render of the dense scene from a camera of shape (1,): (H, W, 3) in [0, 1], exact, on the CPU."""
-        views = views_of_cameras(camera, self.background, self.rasterize_mode)
-        return render(self.dense(keep=True).to(self._device), views[0]).cpu()
+    def frames(self, split: Split) -> Frames:
+        """The images of a split: photos if the scene has them, else its own renders."""
+        return self.rendered[split]
 
 
 class RenderedDataset:
@@ -166,15 +132,17 @@ class RenderedDataset:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    @torch.no_grad()
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """A render, integers in [0, 255] or floats in [0, 1], and its index, as nerfstudio's datasets give photos."""
-        image = self._scene.picture(self.cameras[image_idx : image_idx + 1])
+        """An exact render (H, W, 3) on the CPU, integers in [0, 255] or floats in [0, 1], and its index."""
+        scene = self._scene
+        views = views_of_cameras(self.cameras[image_idx : image_idx + 1], scene.background, scene.rasterize_mode)
+        image = render(scene.dense(keep=True).to(scene.device), views[0]).cpu()
         return {
             "image": (255 * image).round().to(torch.uint8) if image_type == "uint8" else image,
             "image_idx": image_idx,
         }
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        frames = self._scene.rendered_train if self._split == "train" else self._scene.rendered_eval
-        _, data = frames[index]  # from the cache
+        _, data = self._scene.rendered[self._split][index]  # from the cache
         return {**data, "image": in_unit_range(data["image"])}

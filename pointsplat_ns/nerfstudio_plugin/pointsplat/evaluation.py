@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frame
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.terminal import print_table
+from pointsplat_ns.system.threads import now
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
@@ -30,8 +30,8 @@ METRICS = ("psnr", "ssim", "lpips")
 
 VARIANTS = ("dense", "pruned", "refined")
 
-REFERENCES = {True: "photos", False: "dense renders"}
-"""What renders are compared with, by whether the scene has photos."""
+PHOTOS, RENDERS = "photos", "dense renders"
+"""What renders are compared with."""
 
 COLUMNS = (("psnr", "PSNR dB", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3), ("gaussians", "Gaussians", 0),
            ("megabytes", "MB", 2), ("fps", "fps", 1))  # fmt: skip
@@ -43,8 +43,8 @@ class SceneReport:
     """Metrics of the variants of one scene, as means over its held-out photos."""
 
     name: str
-    has_photos: bool
-    """Whether renders were compared with photos; otherwise with renders of the dense scene."""
+    reference: str
+    """What renders were compared with: :data:`PHOTOS` or :data:`RENDERS`."""
     views: int
     variants: dict[str, dict[str, Any]]
     """By variant: psnr (dB), ssim, lpips (None if it cannot be computed), gaussians, megabytes, fps."""
@@ -53,14 +53,6 @@ class SceneReport:
     last_picture: Tensor | None
     """Photo and variants of the last view side by side, (H, W * (1 + variants), 3) in [0, 1]."""
     seen_in_training: bool = True
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def block(self) -> dict[str, Any]:
-        """The scene in the results of ``ns-eval``."""
-        rows = {name: {k: _finite(v) for k, v in row.items()} for name, row in self.variants.items()}
-        reference = REFERENCES[self.has_photos]
-        about = {"seen_in_training": self.seen_in_training, "views": self.views}
-        return {**about, **rows, "seconds": self.seconds, "reference": reference}
 
 
 @torch.no_grad()
@@ -73,19 +65,9 @@ def evaluate_scene(
     picture_folder: Path | None = None,
     progress: bool = False,
 ) -> SceneReport:
-    """Render each variant from each photo's camera and compare the render with the photo.
-
-    Args:
-        model: renders the variants; must be in evaluation mode.
-        scene: gives the background and the rasterize mode.
-        variants: the scene's variants by name, on the model's device.
-        frames: cameras of shape (1,) and their photos.
-        lpips: computes LPIPS. If it fails for one view, the scene has no LPIPS.
-        picture_folder: folder for an image of every view; None writes none.
-
-    Raises:
-        DataError: if there is no photo.
-    """
+    """Render each variant, on the model's device, from each photo's camera of shape (1,), and compare the render with
+    the photo. The model must be in evaluation mode. If LPIPS fails for one view, the scene has none. Images of all
+    views go to ``picture_folder``, if it is given. Raises DataError if there is no photo."""
     values: dict[str, dict[str, list[float]]] = {v: {m: [] for m in METRICS} for v in variants}
     seconds: dict[str, list[float]] = {v: [] for v in variants}
     picture, views = None, 0
@@ -115,34 +97,38 @@ def evaluate_scene(
     rows = {
         name: {metric: _mean(values[name][metric]) for metric in METRICS}
         | {"gaussians": len(gaussians), "megabytes": gaussians.megabytes}
-        | {"fps": 1.0 / statistics.median(seconds[name])}
+        | {"fps": _finite(1.0 / statistics.median(seconds[name]))}
         for name, gaussians in variants.items()
     }
-    return SceneReport(scene.name, scene.has_photos, views, rows, values, picture)
+    return SceneReport(scene.name, PHOTOS if scene.has_photos else RENDERS, views, rows, values, picture)
 
 
 def summarize(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
     """The results that ``ns-eval`` writes as JSON, with None for values that are not finite or not computed. Means are
     over the scenes that are compared with photos, or over all where there is none."""
-    judged = [report for report in reports if report.has_photos] or reports
-    scenes = {report.name: report.block() for report in reports}
-    return {**_means(judged, with_std), "reference": REFERENCES[judged[0].has_photos], "scenes": scenes}
-
-
-def _means(reports: list[SceneReport], with_std: bool) -> dict[str, Any]:
-    unseen = [r for r in reports if not r.seen_in_training]
-    seen = [r for r in reports if r.seen_in_training]
-    judged = unseen or reports
-    means: dict[str, Any] = {}
+    judged = [report for report in reports if report.reference == PHOTOS] or reports
+    unseen = [report for report in judged if not report.seen_in_training]
+    seen = [report for report in judged if report.seen_in_training]
+    summary: dict[str, Any] = {}
     for metric in METRICS:
-        means[metric] = _mean([r.variants["refined"][metric] for r in judged])
+        summary[metric] = _mean([report.variants["refined"][metric] for report in unseen or judged])
         if with_std:
-            per_view = [value for r in judged for value in r.per_view["refined"][metric]]
-            means[f"{metric}_std"] = _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
-    means["average"] = _average(reports)
+            per_view = [value for report in unseen or judged for value in report.per_view["refined"][metric]]
+            summary[f"{metric}_std"] = _finite(statistics.stdev(per_view)) if len(per_view) > 1 else None
+    summary["average"] = _average(judged)
     if unseen and seen:
-        means["average_unseen"], means["average_seen"] = _average(unseen), _average(seen)
-    return means
+        summary["average_unseen"], summary["average_seen"] = _average(unseen), _average(seen)
+    summary["reference"] = judged[0].reference
+    summary["scenes"] = {
+        report.name: {
+            "seen_in_training": report.seen_in_training,
+            "views": report.views,
+            **report.variants,
+            "reference": report.reference,
+        }
+        for report in reports
+    }
+    return summary
 
 
 def print_summary(summary: dict[str, Any]) -> None:
@@ -167,7 +153,7 @@ def print_summary(summary: dict[str, Any]) -> None:
     print_table(header, rows, title=f"{made}; compared with {reference}", left=(0, 1, 2), section=len(VARIANTS))
     others = [name for name, scene in scenes.items() if scene["reference"] != reference]
     if others:
-        print(f"compared with {REFERENCES[False]}, and in no mean: {', '.join(others)}")
+        print(f"compared with {RENDERS}, and in no mean: {', '.join(others)}")
     if "lpips_note" in summary:
         print(f"no LPIPS: {summary['lpips_note']}")
 
@@ -178,7 +164,6 @@ def only_finite(values: dict[str, Any]) -> dict[str, float]:
 
 
 def _average(reports: list[SceneReport]) -> dict[str, dict[str, float | None]]:
-    """Means over scenes, by variant."""
     return {
         name: {key: _mean([r.variants[name][key] for r in reports]) for key in row}
         for name, row in reports[0].variants.items()
@@ -193,10 +178,3 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def now(device: torch.device) -> float:
-    """Seconds since any moment, once the device has done its work."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()

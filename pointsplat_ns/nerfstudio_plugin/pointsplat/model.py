@@ -1,26 +1,22 @@
 """The PointSplat model: a dense scene is pruned once, refined by one network, and rendered.
 
-To nerfstudio it is a Splatfacto model whose Gaussians are the refined ones of one scene, so that the
-viewer and ``ns-export gaussian-splat`` work on it unchanged. Only the network is trained and saved.
+To nerfstudio's viewer and exporter it is a Splatfacto model, whose Gaussians are the refined ones of one scene.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import ModelConfig
-from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel
+from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from tyro.conf import Fixed, Suppress
 
 from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import PointSplatError, SceneError
@@ -94,13 +90,6 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     lpips_net: Literal["auto", "alex", "vgg"] = "auto"
     """Network of LPIPS in the training loss. auto is vgg on CUDA, and elsewhere alex, which is thirty times cheaper."""
 
-    # Settings of every nerfstudio model that have no effect here: hidden on the command line.
-    enable_collider: Suppress[Fixed[bool]] = False
-    collider_params: Suppress[Fixed[dict[str, float] | None]] = None
-    loss_coefficients: Suppress[Fixed[dict[str, float]]] = field(default_factory=dict)
-    eval_num_rays_per_chunk: Suppress[Fixed[int]] = 4096
-    prompt: Suppress[Fixed[str | None]] = None
-
     sh_degree: ClassVar[int] = 3
     """Read by ``ns-export``: above 0, colours are SH coefficients. A scene may have any degree."""
 
@@ -109,60 +98,45 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
         scene."""
         return PruneSettings(self.keep if keep is None else keep, self.by, self.opacity_weight)
 
-    def network_options(self) -> dict[str, Any]:
-        """The options of the network that the preset of its size does not decide."""
-        return network_options(vars(self))
 
-    def check(self) -> None:
-        """Raise a PointSplatError for settings that fit no scene."""
-        for keep in (self.keep, *self.more_keeps):
-            self.prune_settings(keep)
-        if not 0 <= self.lpips_weight < math.inf:  # NaN fails too
-            raise PointSplatError(
-                f"--pipeline.model.lpips-weight {self.lpips_weight:g}: expected a finite number, 0 or above"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class PrunedScene:
-    """A pruned scene and what the network needs beside it."""
+class PrunedScene(NamedTuple):
+    """A pruned scene, on the device of the network, and its neighbour tables, None if it is empty."""
 
     pruned: Gaussians
-    """On the device of the network."""
     structure: Structure | None
-    """The neighbour tables of the pruned scene; None if it is empty."""
-    seconds: float
-    """Duration of pruning, without reading the scene."""
 
 
 class PointSplatModel(SplatfactoModel):
-    """The model described in the module's docstring. The scenes are those of the ``datamanager`` that it is given."""
+    """Prunes, refines and draws the scenes of the ``datamanager`` that it is given."""
 
     config: PointSplatModelConfig  # type: ignore[assignment]  # Splatfacto's options would have no effect here
 
     def populate_modules(self) -> None:
-        """Build the network. The Gaussians of scenes are not parameters of the model. Raises PointSplatError if the
-        config is not valid."""
-        self.config.check()
-        self.refiner = Refiner(preset(self.config.size, **self.config.network_options()))
-        self.refiner.encoder.requires_grad_(self.config.train_encoder)
+        """Build the network. The Gaussians of scenes are not parameters of the model."""
+        config = self.config
+        for keep in (config.keep, *config.more_keeps):
+            config.prune_settings(keep)
+        if not 0 <= config.lpips_weight < math.inf:  # NaN fails too
+            raise PointSplatError(
+                f"--pipeline.model.lpips-weight {config.lpips_weight:g}: expected a finite number, 0 or above"
+            )
+        self.refiner = Refiner(preset(config.size, **network_options(vars(config))))
+        self.refiner.encoder.requires_grad_(config.train_encoder)
         self.crop_box: OrientedBox | None = None
         manager: ScenesDataManager = self.kwargs["datamanager"]
         self.scenes, self.shown, self._cache = manager.scenes, manager.shown, manager.cache
-        self._latest: tuple[Any, PrunedScene | None] = None, None
-        """The pruned scene of the latest step, which is kept even if the cache has no room for it, after its key."""
         self.no_lpips_reason: str | None = None
         """Why LPIPS is left out of the loss; None while it is part of it."""
         self._refined: tuple[int, Gaussians] | None = None
 
     def load_state_dict(self, dict, **kwargs):  # type: ignore[override]
-        """Load the network's weights. Splatfacto's own method would look for Gaussians. Raises SceneError if the
-        weights are those of another network; nerfstudio would load the part that fits."""
+        """Load the network's weights. Raises SceneError if they are those of another network; nerfstudio would load the
+        part that fits."""
         self._refined = None
         try:
             return torch.nn.Module.load_state_dict(self, dict, **{**kwargs, "strict": True})
         except RuntimeError as error:
-            options = ", ".join(f"{name} {value}" for name, value in self.config.network_options().items())
+            options = ", ".join(f"{name} {value}" for name, value in network_options(vars(self.config)).items())
             raise SceneError(
                 f"the checkpoint does not hold a network of size {self.config.size} with {options}; expected the "
                 "settings that it was trained with"
@@ -178,25 +152,22 @@ class PointSplatModel(SplatfactoModel):
         return {name: parts for name, parts in groups.items() if name != "encoder" or self.config.train_encoder}
 
     def pruned_scene(self, index: int, dense: Gaussians | None = None, keep: float | None = None) -> PrunedScene:
-        """A pruned scene and its neighbour tables, by its index, from memory if it was pruned before. ``dense`` are its
-        Gaussians, if they have been read already; ``keep`` is by default the config's. Raises a PointSplatError that
-        names the scene if the settings do not fit it."""
+        """A pruned scene by its index, from memory if it was pruned before. ``dense`` are its Gaussians, if they have
+        been read; ``keep`` is by default the config's. Raises a PointSplatError that names the scene if the settings do
+        not fit it."""
         scene, settings = self.scenes[index], self.config.prune_settings(keep)
         key = "pruned", scene.name, settings
-        found = self._latest[1] if self._latest[0] == key else self._cache.get(key)
+        found = self._cache.get(key)
         if found is None:
             dense = scene.dense(keep=False) if dense is None else dense
-            start = time.perf_counter()
             try:
                 smaller = settings.prune(dense)
             except PointSplatError as error:
                 raise type(error)(f"{scene.source}: {error}") from error
-            seconds = time.perf_counter() - start
             CONSOLE.log(f"{scene.name}: kept {len(smaller):,} of {len(dense):,} Gaussians")
             smaller = smaller.to(self.device)
-            found = PrunedScene(smaller, self.refiner.prepare(smaller), seconds)
+            found = PrunedScene(smaller, self.refiner.prepare(smaller))
             self._cache.put(key, found)
-        self._latest = key, found
         return found
 
     def refine(self, index: int) -> Gaussians:
@@ -218,13 +189,8 @@ class PointSplatModel(SplatfactoModel):
         return self._refined[1]
 
     def draw(self, gaussians: Gaussians, scene: DenseScene, camera: Cameras) -> dict[str, Tensor]:
-        """Render Gaussians with a scene's background and rasterize mode, from a camera of shape (1,), all on the
-        model's device.
-
-        Returns:
-            ``rgb`` (H, W, 3) in [0, 1], ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation
-            ``depth`` (H, W, 1) in scene units.
-        """
+        """Render Gaussians as a scene is drawn, from a camera of shape (1,): ``rgb`` (H, W, 3) in [0, 1],
+        ``accumulation`` (H, W, 1), ``background`` (H, W, 3), and in evaluation ``depth`` (H, W, 1) in scene units."""
         width, height = int(camera.width.item()), int(camera.height.item())
         image, alpha, _ = self.config.rasterize(
             training=self.training,
@@ -253,10 +219,8 @@ class PointSplatModel(SplatfactoModel):
             outputs["depth"] = torch.where(alpha[0] > 0, depth, depth.max())
         return outputs
 
-    def get_outputs(self, camera: RayBundle | Cameras) -> dict[str, Any]:
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]  # models of rays take those
         """The shown scene, refined, from one camera; inside the viewer's crop box if there is one."""
-        if not isinstance(camera, Cameras):
-            return {}
         need_pinhole(camera)
         gaussians = self.gaussians
         if self.crop_box is not None and not self.training:
@@ -264,46 +228,32 @@ class PointSplatModel(SplatfactoModel):
         return self.draw(gaussians, self.scenes[self.shown], camera)
 
     def losses(self, index: int, frames: list[tuple[Cameras, dict]]) -> tuple[dict, dict[str, Tensor], dict]:
-        """Refine a scene, by its index, and compare its renders with photos from their cameras of shape (1,).
-
-        Returns:
-            Outputs of the last photo's camera; the losses (pixel loss and weighted LPIPS, averaged over the photos);
-            and metrics to log. A loss may be NaN or infinite: the trainer then skips the step.
-        """
-        refined, scene = self.refine(index), self.scenes[index]
+        """Refine a scene, by its index, and compare its renders with photos from their cameras of shape (1,): outputs
+        of the last photo's camera; the pixel loss and the weighted LPIPS, averaged over the photos; and metrics to log.
+        Once LPIPS could not be computed it stays left out, so that the loss does not change back."""
+        config, refined, scene = self.config, self.refine(index), self.scenes[index]
         outputs: dict[str, Tensor] = {}
         pairs = []
         for camera, data in frames:
             outputs = self.draw(refined, scene, camera)
             mask = data.get("mask", 1)
             pairs.append((outputs["rgb"] * mask, self.photo_of(data, outputs["background"]) * mask))
-        quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
-        return outputs, self.loss(pairs), {"psnr": quality, "gaussian_count": len(refined)}
-
-    def loss(self, pairs: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-        """The terms of the loss by name, as means over pairs of renders and photos, each (H, W, 3) in [0, 1]: the pixel
-        loss, and the weighted ``lpips``. Once LPIPS could not be computed it stays left out, so that the loss does not
-        change back during training."""
-        config = self.config
-        pixel_loss = PIXEL_LOSSES[config.pixel_loss]
-        losses: dict[str, Tensor] = {}
-        losses[config.pixel_loss] = torch.stack([pixel_loss(render - photo) for render, photo in pairs]).mean()
+        pixel_loss = torch.stack([PIXEL_LOSSES[config.pixel_loss](render - photo) for render, photo in pairs]).mean()
+        losses: dict[str, Tensor] = {config.pixel_loss: pixel_loss}
         if config.lpips_weight > 0 and self.no_lpips_reason is None:
             cheap: Literal["alex", "vgg"] = "vgg" if self.device.type == "cuda" else "alex"
-            net = cheap if config.lpips_net == "auto" else config.lpips_net
             try:
-                lpips = cached_lpips(net, pairs[0][0].device)
+                lpips = cached_lpips(cheap if config.lpips_net == "auto" else config.lpips_net, pairs[0][0].device)
                 losses["lpips"] = config.lpips_weight * torch.stack([lpips(*pair) for pair in pairs]).mean()
             except (LpipsUnavailable, ImageError) as error:  # no weights, or a picture too small for the network
                 self.no_lpips_reason = str(error)
                 CONSOLE.log(f"going on without LPIPS in the loss: {error}")
-        return losses
+        quality = torch.stack([psnr(render.detach(), photo) for render, photo in pairs]).mean()
+        return outputs, losses, {"psnr": quality, "gaussian_count": len(refined)}
 
     def photo_of(self, data: dict[str, Any], background: Tensor) -> Tensor:
         """A photo (H, W, 3) in [0, 1], composited over ``background`` if it has an alpha channel."""
         return self.composite_with_background(in_unit_range(data["image"]).to(self.device), background)
-
-    # The attributes of a Splatfacto model that nerfstudio's viewer and exporter read.
 
     @property
     def gaussians(self) -> Gaussians:
@@ -317,15 +267,5 @@ class PointSplatModel(SplatfactoModel):
 
     @property
     def gauss_params(self) -> dict[str, Tensor]:  # type: ignore[override]
-        """The shown scene's parameters by Splatfacto's names."""
+        """The shown scene's parameters by Splatfacto's names, for nerfstudio's viewer and exporter."""
         return dict(self.gaussians.items())
-
-    @property
-    def colors(self) -> Tensor:
-        """Colours (N, 3) of the shown scene by the constant SH coefficients alone."""
-        return SH2RGB(self.gaussians.features_dc)
-
-    @property
-    def shs_0(self) -> Tensor:
-        """Constant SH coefficients of the shown scene, (N, 3)."""
-        return self.gaussians.features_dc

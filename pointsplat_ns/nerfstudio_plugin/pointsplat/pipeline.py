@@ -12,20 +12,14 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch.cuda.amp.grad_scaler import GradScaler
 
+from pointsplat_ns.compression.trained_refiner import network_options
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io.runs import RUN_FILES
 from pointsplat_ns.metrics.lpips import ReportedLpips
+from pointsplat_ns.nerfstudio_plugin.pointsplat import evaluation
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager, ScenesDataManagerConfig
-from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import (
-    SceneReport,
-    evaluate_scene,
-    now,
-    only_finite,
-    print_summary,
-    summarize,
-)
+from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import evaluate_scene, only_finite
 from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel, PointSplatModelConfig
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system import processes
@@ -47,8 +41,7 @@ class PointSplatPipelineConfig(VanillaPipelineConfig):
 
 
 class PointSplatPipeline(VanillaPipeline):
-    """Each step prunes and refines one scene and renders it from some of its training cameras. Raises SceneError if
-    ``--data`` holds no scene, ``world_size`` processes are not connected, or several share batch norm."""
+    """Each step prunes and refines one scene and renders it from some of its training cameras."""
 
     datamanager: ScenesDataManager
     config: PointSplatPipelineConfig
@@ -60,7 +53,7 @@ class PointSplatPipeline(VanillaPipeline):
         test_mode: Literal["test", "val", "inference"] = "val",
         world_size: int = 1,
         local_rank: int = 0,
-        grad_scaler: GradScaler | None = None,
+        grad_scaler: Any = None,
     ):
         super(VanillaPipeline, self).__init__()
         if world_size != processes.world_size():
@@ -80,9 +73,7 @@ class PointSplatPipeline(VanillaPipeline):
             device=device, test_mode=test_mode, world_size=world_size, local_rank=processes.rank()
         )
         torch.manual_seed(config.datamanager.seed)
-        self._model = config.model.setup(
-            scene_box=None, num_train_data=0, device=device, grad_scaler=grad_scaler, datamanager=self.datamanager
-        )
+        self._model = config.model.setup(scene_box=None, num_train_data=0, device=device, datamanager=self.datamanager)
         self.model.to(device)
         processes.share_state(self.model.refiner)
         scenes, indices = self.datamanager.scenes, self.datamanager.train_indices
@@ -92,7 +83,7 @@ class PointSplatPipeline(VanillaPipeline):
         """Duration of the training so far, also before it was resumed."""
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The state of the training that checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""
+        """What checkpoints hold beside weights and optimisers, for torch's ``state_dict``."""
         return {"trained_on": sorted(self.trained_on), "seconds": self.seconds}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -105,16 +96,12 @@ class PointSplatPipeline(VanillaPipeline):
 
     @property
     def model(self) -> PointSplatModel:
-        """The model, which is never wrapped for distributed training."""
+        """The model, which is not wrapped for distributed training: the trainer averages gradients."""
         return self._model  # type: ignore[return-value]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict, dict]:
-        """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos.
-
-        Random numbers (the order of serialization curves, dropped paths) depend only on the seed and on the scene's
-        place in the sequence, as does the choice of scene and photos. So a resumed training continues as if it had not
-        been stopped. Several processes take turns in that sequence; losses and metrics are each process's own.
-        """
+        """Outputs of the last photo's camera, losses and metrics of one scene at some of its training photos. Random
+        numbers depend only on the seed and on the scene's place in the sequence, so that a training can be resumed."""
         place = self.datamanager.place(step)
         torch.manual_seed(random.Random(f"{self.config.datamanager.seed} network {place}").getrandbits(63))
         index, frames = self.datamanager.next_train(step)
@@ -141,51 +128,36 @@ class PointSplatPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Metrics of dense, pruned and refined scenes over all held-out photos of all scenes.
-
-        Args:
-            step: given by the trainer, whose log takes only finite numbers: only those are then returned.
-            output_path: folder for images of photo, dense, pruned and refined side by side.
-            get_std: add the standard deviation of the refined scenes' metrics over photos.
-
-        Returns:
-            ``psnr``, ``ssim`` and ``lpips`` of the refined scenes (only of those not trained on, if there are any);
-            ``average``, ``average_unseen`` and ``average_seen`` (over scenes, by variant); and ``scenes``. Values that
-            cannot be computed are None, and ``lpips_note`` says why LPIPS is missing. ``reference``, here and in each
-            scene, says what renders were compared with: ``photos``, or ``dense renders`` if a scene has no photos (its
-            dense variant then has no PSNR). Means are over the scenes with photos if there are any.
-        """
+        """The summary of all held-out photos of all scenes, and ``lpips_note`` if LPIPS is missing. Images of photo and
+        variants side by side go to ``output_path``. Given a ``step``, by the trainer, whose log takes only finite
+        numbers, only those are returned."""
         training = self.training
         self.eval()
         manager, model, lpips = self.datamanager, self.model, ReportedLpips()
-        reports: list[SceneReport] = []
+        reports: list[evaluation.SceneReport] = []
         for index in range(processes.rank(), len(manager.scenes), self.world_size):
             scene = manager.scenes[index]
             dense = scene.dense(keep=False)
-            smaller = model.pruned_scene(index, dense)
-            start = now(model.device)
-            refined = model.refiner(smaller.pruned, smaller.structure)
-            seconds = now(model.device) - start
-            variants = {"dense": dense.to(model.device), "pruned": smaller.pruned, "refined": refined}
-            report = evaluate_scene(model, scene, variants, scene.eval_frames, lpips, output_path, progress=True)
+            pruned, structure = model.pruned_scene(index, dense)
+            variants = {"dense": dense.to(model.device), "pruned": pruned, "refined": model.refiner(pruned, structure)}
+            report = evaluate_scene(model, scene, variants, scene.frames("test"), lpips, output_path, progress=True)
             report.seen_in_training = scene.identity in self.trained_on
-            report.seconds = {"prune": smaller.seconds, "refine": seconds}
             report.last_picture = None
             reports.append(report)
         self.train(training)
         order = {scene.name: index for index, scene in enumerate(manager.scenes)}
         reports = sorted(processes.gathered(reports), key=lambda report: order[report.name])
-        summary = summarize(reports, get_std)
+        summary = evaluation.summarize(reports, get_std)
         config = self.config.model
         pruning = dataclasses.asdict(config.prune_settings())
-        summary["settings"] = {"size": config.size, **config.network_options(), **pruning}
+        summary["settings"] = {"size": config.size, **network_options(vars(config)), **pruning}
         summary["supervision"] = manager.supervision
         if lpips.reason is not None:
             summary["lpips_note"] = lpips.reason
         if step is not None:
             return only_finite(summary)
         if processes.rank() == 0:
-            print_summary(summary)
+            evaluation.print_summary(summary)
         return summary
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:

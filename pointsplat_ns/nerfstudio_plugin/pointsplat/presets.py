@@ -1,8 +1,5 @@
 """The methods ``pointsplat-paper`` and ``pointsplat-authors``: ``pointsplat`` with published settings.
 
-They are methods of their own and not an option of ``pointsplat``: ``ns-train pointsplat-paper --help`` shows their
-values, any of them can be set by hand, and the folder and ``config.yml`` of a run name the preset.
-
 Sources: the paper (A. T. Tran and J. Košecká, "PointSplat: Efficient Geometry-Driven Pruning and Transformer Refinement
 for 3D Gaussian Splatting", arXiv 2604.09903), and the code that its authors released
 (github.com/anhthuan1999/pointsplat). What neither says is as in ``pointsplat``.
@@ -13,10 +10,10 @@ from __future__ import annotations
 import dataclasses
 
 from pointsplat_ns.io.runs import METHOD_NAMES
-from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import (
     REFINER_RATES,
     PointSplatTrainerConfig,
+    adam,
     pointsplat_config,
 )
 from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -79,9 +76,7 @@ def authors_config() -> PointSplatTrainerConfig:
 def _preset(name: str, model: PointSplatModelConfig, rates: dict[str, float], eps: float) -> PointSplatTrainerConfig:
     config = pointsplat_config()
     config.method_name = f"{METHOD_NAMES.refiner}-{name}"
-    config.optimizers = {
-        part: {"optimizer": FusedAdamConfig(lr=rate, eps=eps), "scheduler": None} for part, rate in rates.items()
-    }
+    config.optimizers = adam(rates, eps)
     scenes = ScenesDataManagerConfig(
         supervision="photos",  # section 4, Datasets: images of the scenes
         images_per_step=2,  # section 4, Datasets: "two random images per scene"; the released code: 1 on Replica

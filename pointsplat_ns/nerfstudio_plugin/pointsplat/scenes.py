@@ -1,16 +1,11 @@
-"""The trained scenes, with their posed photos, that the refiner is trained and evaluated on.
-
-A trained run names its data, its dataparser and its coordinate frame. So ``--data`` takes just a run, or any folder
-above several. If the training targets are renders of the dense scenes, photos are not needed, and ``--data`` may also
-name PLY files.
-"""
+"""A trained run as a scene: its Gaussians, and its photos and poses in the frame that it was trained in."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
@@ -22,27 +17,26 @@ from torch import Tensor
 
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.discovery import Supervision, find_runs_and_plys
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.inert_yaml import Tagged
-from pointsplat_ns.io.runs import RUN_FILES, Run, open_run
+from pointsplat_ns.io.runs import RUN_FILES, Run
 from pointsplat_ns.io.splatfacto import read_checkpoint, read_photo_fit
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND
-from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache
-from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, SampledPoses, Split
-from pointsplat_ns.nerfstudio_plugin.undistorted import UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, views_of_cameras
+from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache, UndistortedDataset
+from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, Split
+from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import RasterizeMode
+from pointsplat_ns.views import Views
+
+if TYPE_CHECKING:
+    from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
 
 
 def dataparser_of(run: Run) -> DataParser:
-    """The dataparser that a run was trained with, with the same settings.
-
-    Only classes that nerfstudio or an installed plugin registers are used: the name in the run's file is looked up
-    among them and is never imported. A setting that it does not know is left out, with a line in the log. Raises
-    SceneError if the dataparser is not installed.
-    """
+    """The dataparser that a run was trained with, with the same settings; those that it does not know are logged. Its
+    name is looked up among the classes that nerfstudio or an installed plugin registers, and is never imported.
+    Raises SceneError if it is not there."""
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
     classes = {f"{type(c).__module__}.{type(c).__qualname__}": type(c) for c in all_dataparsers.values()}
@@ -66,19 +60,9 @@ def dataparser_of(run: Run) -> DataParser:
 
 
 def corrected_poses(run: Run, poses: Tensor) -> Tensor:
-    """Poses of a run's training photos with the corrections in its checkpoint, as nerfstudio's model applies them.
-
-    Args:
-        run: a Splatfacto run.
-        poses: (C, 3, 4) camera to world, OpenGL axes, in the order of the training split.
-
-    Returns:
-        (C, 3, 4); ``poses`` itself if the training corrected none.
-
-    Raises:
-        SceneError: if the checkpoint is not usable, or the run does not say how it corrects poses.
-        DataError: if the dataset has another number of training photos than were corrected.
-    """
+    """Poses (C, 3, 4) of a run's training photos, camera-to-world in OpenGL axes, with the corrections in its
+    checkpoint, if there are some, as nerfstudio's model applies them. Raises SceneError if the checkpoint is not
+    usable, or the run does not say how it corrects poses; DataError if it corrected another number of them."""
     adjustments = read_photo_fit(run.checkpoint).adjustments
     if adjustments is None:
         return poses
@@ -103,17 +87,6 @@ def corrected_poses(run: Run, poses: Tensor) -> Tensor:
     return torch.cat([motions[:, :, :3] @ poses[:, :, :3], poses[:, :, 3:] + motions[:, :, 3:]], dim=2)
 
 
-def need_photos_as_rendered(run: Run, instead: str) -> None:
-    """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of its photos: a bilateral
-    grid, or an embedding of appearance. Renders of the scene then do not have the colours of the photos."""
-    colors = read_photo_fit(run.checkpoint).colors
-    if colors:
-        raise DataError(
-            f"{run.checkpoint}: holds {colors}, which fits colours to each training photo; renders of the scene do not "
-            f"have them, so its training photos cannot be used; {instead}"
-        )
-
-
 class TrainedScene(DenseScene):
     """One trained run: its Gaussians and its posed photos, both read when they are needed. Arguments are those of
     :class:`DenseScene`; ``has_photos`` says whether the run's data was found."""
@@ -123,32 +96,24 @@ class TrainedScene(DenseScene):
         name: str,
         run: Run,
         cache: MemoryCache,
-        poses: SampledPoses | None = None,
+        poses: ScenesDataManagerConfig | None = None,
         device: torch.device | str = "cpu",
         has_photos: bool = True,
     ):
         super().__init__(name, run.checkpoint, cache, poses, device)
-        self.run = run
-        self.has_photos = has_photos
+        self.run, self.has_photos, self.rasterize_mode = run, has_photos, run.rasterize_mode
+        self._photos: dict[Split, Frames] = {}
 
     @cached_property
     def identity(self) -> str:
-        """EXPERIMENT/METHOD/TIME and the step. A scene that is trained again has another time, and so another identity.
-
-        The content does not count: a scene that replaces one of the same name, time and step is taken to show the same
-        place, so the network has been trained on it.
-        """
+        """EXPERIMENT/METHOD/TIME and the step: a scene that is trained again has another one. Its content does not
+        count."""
         run = self.run
         return f"{self.name}/{run.method_name}/{run.timestamp} step {run.step}"
 
     def read_dense(self) -> Gaussians:
         """Read the Gaussians from the checkpoint, onto the CPU."""
         return keep_usable(read_checkpoint(self.run.checkpoint), self.run.checkpoint)
-
-    @property
-    def rasterize_mode(self) -> RasterizeMode:
-        """The run's rasterize mode."""
-        return self.run.rasterize_mode
 
     @property
     def background(self) -> Tensor:
@@ -184,86 +149,61 @@ class TrainedScene(DenseScene):
             )
         return outputs
 
-    def _frames(self, split: str) -> Frames:
-        scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
-        scale = float(scale) if isinstance(scale, (int, float)) else 1.0
-        dataset = UndistortedDataset(self._outputs(split), scale)
-        if split == "train":
-            dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
-        return Frames(dataset, cache=self.cache, device=self._device)
-
-    @cached_property
-    def train_frames(self) -> Any:
-        """Training photos at the run's training resolution, in the poses as the training corrected them; without data
+    def frames(self, split: Split) -> Frames:
+        """Photos at the run's training resolution, those of training in the poses as it corrected them; without data
         the scene's own renders."""
-        return self._frames("train") if self.has_photos else self.rendered_train
-
-    @cached_property
-    def eval_frames(self) -> Any:
-        """Held-out photos at the run's training resolution, or without data the scene's own renders."""
-        return self._frames("test") if self.has_photos else self.rendered_eval
+        if not self.has_photos:
+            return self.rendered[split]
+        if split not in self._photos:
+            scale = self.run.datamanager_fields.get("camera_res_scale_factor", 1.0)
+            scale = float(scale) if isinstance(scale, (int, float)) else 1.0
+            dataset = UndistortedDataset(self._outputs(split), scale)
+            if split == "train":
+                dataset.cameras.camera_to_worlds = corrected_poses(self.run, dataset.cameras.camera_to_worlds)
+            self._photos[split] = Frames(dataset, cache=self.cache, device=self.device)
+        return self._photos[split]
 
     def cameras(self, split: Split) -> Cameras:
         """The dataset's cameras, or sampled ones if the data is missing."""
-        if not self.has_photos:
-            return super().cameras(split)
-        return (self.train_frames if split == "train" else self.eval_frames).dataset.cameras
+        return self.frames(split).dataset.cameras if self.has_photos else super().cameras(split)
+
+    def views(self, split: Split) -> Views:
+        """The poses of a split, on the CPU. Raises DataError if there is none, or they are not usable."""
+        cameras = self.cameras(split)
+        if len(cameras) == 0:
+            raise DataError(f"{self.run.data}: no pose in the {split} split; expected at least one")
+        try:
+            views = views_of_cameras(cameras, self.background, self.rasterize_mode)
+        except DataError as error:
+            raise DataError(f"{self.run.data}: {error}") from error
+        return dataclasses.replace(views, viewmats=views.viewmats.detach().cpu(), Ks=views.Ks.detach().cpu())
+
+    def photos(self, split: Split) -> RunPhotos:
+        """The photos of a split, read when they are asked for. Raises DataError as :meth:`views`."""
+        self.views(split)
+        return RunPhotos(self, self.frames(split))
+
+    def need_photos_as_rendered(self, instead: str) -> None:
+        """Raise a DataError, with the advice ``instead``, if the training fitted colours to each of its photos, which
+        renders of the scene do not have: by a bilateral grid, or an embedding of appearance."""
+        colors = read_photo_fit(self.run.checkpoint).colors
+        if colors:
+            raise DataError(
+                f"{self.run.checkpoint}: holds {colors}, which fits colours to each training photo; renders of the "
+                f"scene do not have them, so its training photos cannot be used; {instead}"
+            )
 
 
-def training_scenes(
-    folder: Path,
-    supervision: Supervision,
-    cache: MemoryCache,
-    poses: SampledPoses | None = None,
-    device: torch.device | str = "cpu",
-    need_data: bool = True,
-    data: Path | None = None,
-) -> tuple[Literal["photos", "dense"], list[DenseScene]]:
-    """The scenes that ``--data`` names, and the kind of their training targets.
+class RunPhotos(Sequence[Example]):
+    """Photos of a split, and the views on the CPU that they show once undistorted."""
 
-    Args:
-        folder: a run, a PLY file, or any folder above several.
-        supervision: ``photos`` takes the runs whose data is found, and names the others; ``dense`` takes the runs, with
-            or without their data, and the PLY files; ``auto`` is ``photos`` if there is a run, ``dense`` otherwise.
-        cache, poses, device: passed to the scenes.
-        need_data: whether photos will be needed.
-        data: where the data of the runs is now, as for :func:`~pointsplat_ns.io.runs.open_run`.
+    def __init__(self, scene: TrainedScene, frames: Frames):
+        self._scene, self._frames = scene, frames
 
-    Raises:
-        SceneError: if there is no scene, or photos are needed and those of no run are found.
-        DataError: if photos are needed whose colours a training fitted to each.
-    """
-    runs, plys, nothing = find_runs_and_plys(folder, supervision)
-    if not runs and not plys:
-        if nothing is None:
-            found = "a PLY file, which has no photos" if supervision == "photos" else "no Gaussians in it"
-            found = found if folder.is_file() else "no such file"
-            wanted = "--pipeline.datamanager.supervision dense" if supervision == "photos" else "a 3DGS .ply"
-            raise SceneError(f"{folder}: {found}; expected {wanted}")
-        hint = " (PLY files are trained on with --pipeline.datamanager.supervision dense)"
-        raise SceneError(f"{nothing}{hint if supervision == 'photos' else ', or 3DGS PLY files'}") from nothing
-    chosen: Literal["photos", "dense"] = "dense" if plys or supervision == "dense" else "photos"
-    scenes: list[DenseScene] = []
-    missing: list[str] = []
-    for name, run in runs.items():
-        has_photos = True
-        if need_data:
-            try:
-                run = dataclasses.replace(run, data=open_run(run.config_path, data=data).data)
-            except SceneError:
-                has_photos = False
-                missing.append(f"{run.config_path}: its data {run.data} is not there")
-                what = "left out" if chosen == "photos" else "seen from sampled poses"
-                CONSOLE.log(f"{name} is {what}: {missing[-1]}")
-            if has_photos and chosen == "photos":
-                need_photos_as_rendered(run, "take --pipeline.datamanager.supervision dense")
-        if has_photos or chosen == "dense":
-            scenes.append(TrainedScene(name, run, cache, poses, device, has_photos))
-    scenes += [DenseScene(name, path, cache, poses, device) for name, path in plys.items()]
-    if not scenes:
-        others = f", and that of {len(missing) - 1} more runs" if missing[1:] else ""
-        raise SceneError(
-            f"{missing[0]}{others}; name the folder where it is now (--pipeline.datamanager.scene-data DIR), or take "
-            "--pipeline.datamanager.supervision dense"
-        )
-    return chosen, scenes
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Example:  # type: ignore[override]
+        camera, data = self._frames[index]
+        view = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
+        return Example(view, data["image"][..., :3], data.get("mask"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,9 +47,7 @@ class PointSplatTrainer(StoppableTrainer):
         self._latest = self.clock()
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers. Raises PointSplatError if ``seconds`` is out of range."""
-        if self.config.seconds is not None and not 0 < self.config.seconds < math.inf:  # NaN fails too
-            raise PointSplatError(f"--seconds {self.config.seconds:g}: expected a finite number above 0")
+        """The optimisers, and the schedules of those that have none of their own."""
         optimizers = super().setup_optimizers()
         for name, optimizer in optimizers.optimizers.items():
             if name not in optimizers.schedulers:
@@ -76,7 +73,7 @@ class PointSplatTrainer(StoppableTrainer):
                 "it is the total"
             )
 
-    def update(self, step: int, names: list[str], skipped: bool) -> None:
+    def update(self, step: int, skipped: bool) -> None:
         """As the base class. Before, count the time since the step before, and end the training after this one if the
         time is over. The first process's clock counts in all."""
         pipeline, now = self.pipeline, self.clock()
@@ -88,15 +85,13 @@ class PointSplatTrainer(StoppableTrainer):
             if share >= 1:
                 self.stop_training, self._last_step = True, step
                 CONSOLE.log(f"the time is over: {step + 1} steps in {pipeline.seconds:.0f} s")
-        super().update(step, names, skipped)
+        super().update(step, skipped)
 
-    def clip(self, names: list[str]) -> None:
+    def clip(self) -> None:
         """Scale all gradients down to the norm ``global_norm`` of the config, if it is set and they exceed it."""
         if self.config.global_norm is not None:
-            if self.grad_scaler.is_enabled():
-                for name in names:
-                    self.grad_scaler.unscale_(self.optimizers.optimizers[name])
-            clip_grad_norm_([p for name in names for p in self._trained(name)], self.config.global_norm)
+            groups = [self._trained(name) for name in self.optimizers.optimizers]
+            clip_grad_norm_([p for group in groups for p in group], self.config.global_norm)
 
     def _after_train(self) -> None:
         """As nerfstudio's, which counts the step before which it stops as done."""

@@ -23,7 +23,6 @@ class ReplicaDataParserConfig(DataParserConfig):
     """Posed photos, with or without depth images, in NICE-SLAM's or Semantic-NeRF's Replica layout"""
 
     _target: type = field(default_factory=lambda: ReplicaDataParser)
-    """target class to instantiate"""
     data: Path = Path("data/replica/office0")
     """Scene folder, with traj.txt and results/ (cam_params.json in it or in the folder above), or a sequence with
     traj_w_c.txt and rgb/."""
@@ -48,79 +47,49 @@ class ReplicaDataParser(DataParser):
         """See the base class. ``split`` is "train", or "val" or "test", which are the same held-out frames. Raises
         DataError if the folder or the configuration cannot be used."""
         config = self.config
-        self._check_config()
-        self._scene = scene = self._scene or load_replica(config.data)  # once for both splits
-        train, held_out = self._split(scene)
-        part = scene.select(train if split == "train" else held_out)
-        params = scene.params
-        cx, cy = params.principal_point
-
-        camera_to_worlds = flip_camera_axes(torch.from_numpy(part.poses))[:, :3]  # OpenCV to nerfstudio's OpenGL
-        cameras = Cameras(
-            camera_to_worlds.float(), params.fx, params.fy, cx, cy, params.width, params.height,
-            camera_type=CameraType.PERSPECTIVE,
-        )  # fmt: skip
-        metadata: dict = {}
-        if part.depths is not None:
-            metadata["depth_filenames"] = list(part.depths)
-            metadata["depth_unit_scale_factor"] = 1.0 / params.scale
-        if split == "train" and config.load_seed_points:
-            metadata.update(self._seed_points(part))
-        return DataparserOutputs(
-            image_filenames=list(part.photos),
-            cameras=cameras,
-            scene_box=_scene_box(scene),
-            metadata=metadata,
-        )
-
-    def _check_config(self) -> None:
         for name, least in {"frame_stride": 1, "eval_every": 2, "num_seed_points": 1}.items():
-            if (value := getattr(self.config, name)) < least:
+            if (value := getattr(config, name)) < least:
                 raise DataError(f"--{name.replace('_', '-')} {value}: expected a number of at least {least}")
-
-    def _split(self, scene: ReplicaScene) -> tuple[list[int], list[int]]:
-        """Positions of the training and of the held-out frames in ``scene``."""
-        config = self.config
-        used = list(range(0, len(scene), config.frame_stride))
-        held_out = used[:: config.eval_every]
+        self._scene = scene = self._scene or load_replica(config.data)  # once for both splits
+        used = range(0, len(scene), config.frame_stride)
+        held_out = list(used[:: config.eval_every])
         train = sorted(set(used) - set(held_out))
         if not train or not held_out:
             raise DataError(
                 f"{scene.folder}: {len(scene)} usable frames leave {len(train)} for training and {len(held_out)} "
                 "held out; expected at least one of each: change --frame-stride or --eval-every"
             )
-        return train, held_out
-
-    def _seed_points(self, train: ReplicaScene) -> dict[str, torch.Tensor]:
-        if train.depths is None:
-            CONSOLE.log(f"{train.folder}: no depth image of every photo, so no seed points")
-            return {}
-        xyz, rgb = fuse_depth(train, self.config.num_seed_points)
-        if len(xyz) == 0:
-            CONSOLE.log(f"{train.folder}: no pixel of the depth images is known, so no seed points")
-            return {}
-        return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb)}
-
-
-def _scene_box(scene: ReplicaScene) -> SceneBox:
-    """The box of all camera positions, widened on every side by its diagonal (at least one unit)."""
-    centers = scene.poses[:, :3, 3]
-    low, high = centers.min(axis=0), centers.max(axis=0)
-    margin = max(float(np.linalg.norm(high - low)), 1.0)
-    aabb = np.stack([low - margin, high + margin])
-    return SceneBox(aabb=torch.from_numpy(aabb.astype(np.float32)))
+        part = scene.select(train if split == "train" else held_out)
+        params, (cx, cy) = scene.params, scene.params.principal_point
+        camera_to_worlds = flip_camera_axes(torch.from_numpy(part.poses))[:, :3]  # OpenCV to nerfstudio's OpenGL
+        cameras = Cameras(
+            camera_to_worlds.float(), params.fx, params.fy, cx, cy, params.width, params.height,
+            camera_type=CameraType.PERSPECTIVE,
+        )  # fmt: skip
+        metadata: dict[str, torch.Tensor] = {}
+        if split == "train" and config.load_seed_points:
+            xyz, rgb = fuse_depth(part, config.num_seed_points)
+            if len(xyz) > 0:
+                metadata = {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb)}
+            else:
+                CONSOLE.log(f"{scene.folder}: photos without depth images, or no known pixel in these: no seed points")
+        centers = scene.poses[:, :3, 3]
+        low, high = centers.min(axis=0), centers.max(axis=0)
+        margin = max(float(np.linalg.norm(high - low)), 1.0)  # around all cameras: their distance, or one unit
+        box = torch.from_numpy(np.stack([low - margin, high + margin]).astype(np.float32))
+        return DataparserOutputs(list(part.photos), cameras, scene_box=SceneBox(aabb=box), metadata=metadata)
 
 
 def fuse_depth(scene: ReplicaScene, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unproject the depth images of a scene that has them and thin them to at most ``num_points`` points: xyz float32
-    (P, 3) in scene units and rgb uint8 (P, 3). Deterministic; P = 0 if no pixel has a depth.
+    """Unproject the depth images of a scene and thin them to at most ``num_points`` points: xyz float32 (P, 3) in scene
+    units and rgb uint8 (P, 3). Deterministic; P = 0 without depth images, or if no pixel has a depth.
 
-    At most 200 frames are read, evenly spaced, one at a time: neighbouring frames of a video see the same surfaces. At
-    most ``40 * num_points`` pixels are kept in total, several for most voxels, so that time and memory do not grow with
-    the length of the capture. Each occupied voxel gives one point, the mean of its pixels. The voxels are as small as
-    ``num_points`` allows.
+    At most 200 frames are read, evenly spaced, and ``40 * num_points`` pixels, so that time and memory do not grow with
+    the length of the capture. Each occupied voxel, as small as ``num_points`` allows, gives the mean of its pixels.
     """
-    depths, params = scene.depths or (), scene.params
+    depths, params = scene.depths, scene.params
+    if depths is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     cx, cy = params.principal_point
     chosen = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 200)).round().astype(int))
     budget = max(num_points * 40 // len(chosen), 1)
@@ -151,11 +120,16 @@ def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.nd
     low = xyz.min(axis=0).astype(np.float64)
     extent = max(float((xyz.max(axis=0) - low).max()), 1e-12)
     finest, coarsest = extent / 2**20, extent * 1.001  # 20 bits an axis fit an int64 key
-    keys = _voxel_keys(xyz, low, coarsest)
+
+    def voxels(size: float) -> np.ndarray:
+        cell = np.floor((xyz - low) / size).astype(np.int64)
+        return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+
+    keys = voxels(coarsest)
     # The number of occupied voxels falls with their size: bisect the size on a log scale, to 1 %.
     while coarsest / finest > 1.01:
         size = float(np.sqrt(finest * coarsest))
-        trial = _voxel_keys(xyz, low, size)
+        trial = voxels(size)
         if len(np.unique(trial)) > num_points:
             finest = size
         else:
@@ -169,11 +143,6 @@ def voxel_thin(xyz: np.ndarray, rgb: np.ndarray, num_points: int) -> tuple[np.nd
 
     points = (mean(xyz.astype(np.float64) - low) + low).astype(np.float32)
     return points, np.clip(mean(rgb).round(), 0, 255).astype(np.uint8)
-
-
-def _voxel_keys(xyz: np.ndarray, low: np.ndarray, size: float) -> np.ndarray:
-    cell = np.floor((xyz - low) / size).astype(np.int64)
-    return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
 
 
 def _inner(depth: np.ndarray, edge: float = 0.05) -> np.ndarray:

@@ -1,73 +1,49 @@
-"""Reads scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF.
+"""Reads scenes in the Replica layouts of NICE-SLAM and of Semantic-NeRF, without nerfstudio.
 
-NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV
-axes: x right, y down, z forward), ``results/frame*.jpg|png`` and, optionally,
-``results/depth*.png`` (16 bit; depth along the optical axis = value / ``scale``; 0 unknown). The
-intrinsics are in ``cam_params.json``, in the scene folder or in the one above it. Poses belong to
-frames by order: line k is the pose of the k-th frame by number.
+NICE-SLAM: a scene folder holds ``traj.txt`` (one camera-to-world per line, 16 numbers, row by row, OpenCV axes: x
+right, y down, z forward; line k is the pose of the k-th frame by number), ``results/frame*.jpg|png`` and, optionally,
+``results/depth*.png`` (16 bit; depth along the optical axis = value / ``scale``; 0 unknown). The intrinsics are in
+``cam_params.json``, in the scene folder or in the one above it.
 
 Semantic-NeRF: a sequence (``room_0/Sequence_1``) holds ``traj_w_c.txt``, ``rgb/rgb_0.png`` and so on, and optionally
 ``depth/depth_0.png`` (16 bit, millimetres), with poses as above. Its cameras have a horizontal field of view of 90
 degrees, which no file says; a ``cam_params.json`` overrides it.
-
-nerfstudio is not imported.
 """
 
 import json
-import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.io.files import one_line, read_text
+from pointsplat_ns.io.files import logger, one_line, read_text
 from pointsplat_ns.io.pictures import exif_hint
-
-logger = logging.getLogger(__name__)
 
 FARTHEST = 1e18
 """Poses with larger numbers count as lost tracking: float32, in which scenes are trained, cannot square them."""
 
 
-@dataclass(frozen=True)
-class FileNames:
-    """Names of the files in a scene folder; the first group of a pattern is the number of a frame."""
+class Layout(NamedTuple):
+    """Names in a scene folder: of the trajectory, of folders, and of files in these, whose first group is a number."""
 
     trajectory: str
     photos: str
-    """Folder of the photos."""
     photo: str
-    """Pattern of a photo's name."""
     depths: str
-    """Folder of the depth images."""
     depth: str
-    """Pattern of a depth image's name."""
-    example: str
-    """A photo's path."""
 
 
-NICE_SLAM = FileNames(
-    "traj.txt", "results", r"frame(\d+)\.(?:jpg|jpeg|png)", "results", r"depth(\d+)\.png", "results/frame000000.jpg"
-)
-SEMANTIC_NERF = FileNames(
-    "traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png", "rgb/rgb_0.png"
-)
+NICE_SLAM = Layout("traj.txt", "results", r"frame(\d+)\.(?:jpg|jpeg|png)", "results", r"depth(\d+)\.png")
+SEMANTIC_NERF = Layout("traj_w_c.txt", "rgb", r"rgb_(\d+)\.(?:jpg|jpeg|png)", "depth", r"depth_(\d+)\.png")
 
 
 @dataclass(frozen=True)
 class PinholeParams:
-    """Intrinsics as in ``cam_params.json``, without a pixel-centre correction.
-
-    Attributes:
-        width, height: Image size in pixels.
-        fx, fy, cx, cy: Focal lengths and principal point in pixels.
-        scale: Raw depth counts per scene unit.
-        path: The file they come from.
-    """
+    """Intrinsics as in ``cam_params.json``, in pixels, without a pixel-centre correction."""
 
     width: int
     height: int
@@ -75,37 +51,30 @@ class PinholeParams:
     fy: float
     cx: float
     cy: float
-    scale: float
-    path: Path
+    scale: float  # raw depth counts per scene unit
+    path: Path  # the file they come from
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Principal point in pixels, with the centre of the top left pixel at (0.5, 0.5), as in rasterizers.
-
-        If it is exactly (w / 2, h / 2) in the file, coordinates start at the corner of the image. Otherwise the centre
-        of the first pixel is 0, as in Replica's own file (599.5 of 1200) and in OpenCV, and half a pixel is added.
-        """
+        """Principal point in pixels from the corner of the image, as in rasterizers. If it is exactly (w / 2, h / 2) in
+        the file, it is that there, too. Otherwise the centre of the first pixel is 0, as in Replica's own file (599.5
+        of 1200) and in OpenCV."""
         shift = 0.0 if (self.cx, self.cy) == (self.width / 2, self.height / 2) else 0.5
         return self.cx + shift, self.cy + shift
 
 
 @dataclass(frozen=True)
 class ReplicaScene:
-    """A scene: paths and numbers, no pixels.
-
-    Attributes:
-        folder: The scene folder.
-        params: Intrinsics and depth scale.
-        photos: By ascending number.
-        depths: One depth image for each photo, or None if one has none.
-        poses: float64 (F, 4, 4) camera-to-world, OpenCV axes, rotations exactly orthonormal.
-    """
+    """A scene: paths and numbers, no pixels."""
 
     folder: Path
     params: PinholeParams
     photos: tuple[Path, ...]
+    """By ascending number."""
     depths: tuple[Path, ...] | None
+    """One depth image for each photo, or None if one has none."""
     poses: np.ndarray  # [F, 4, 4]
+    """float64, camera-to-world, OpenCV axes, rotations exactly orthonormal."""
 
     def __len__(self) -> int:
         return len(self.photos)
@@ -121,12 +90,8 @@ class ReplicaScene:
 
 
 def load_replica(folder: Path) -> ReplicaScene:
-    """Read a scene. No photo is opened, except for the size of those of Semantic-NeRF.
-
-    Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking), are dropped, with one warning. A
-    DataError names a file that is missing, unreadable or inconsistent.
-    """
-    folder = Path(folder)
+    """Read a scene, but no photo. Frames whose pose is not finite, or farther than :data:`FARTHEST` (lost tracking),
+    are dropped, with one warning. A DataError names a file that is missing, unreadable or inconsistent."""
     hint = "a scene folder holds traj.txt and results/frame*.jpg, or traj_w_c.txt and rgb/rgb_*.png"
     layouts = (NICE_SLAM, SEMANTIC_NERF)
     names = next((each for each in layouts if (folder / each.trajectory).is_file()), None)
@@ -137,7 +102,7 @@ def load_replica(folder: Path) -> ReplicaScene:
     trajectory = folder / names.trajectory
     photos, depths = _numbered(folder / names.photos, names.photo), _numbered(folder / names.depths, names.depth)
     if not photos:
-        raise DataError(f"{folder / names.photos}: no photo found; expected {names.example} and so on")
+        raise DataError(f"{folder / names.photos}: no photo found; {hint}")
     numbers = sorted(photos)
     poses = read_trajectory(trajectory)
     if len(poses) != len(numbers):
@@ -162,7 +127,7 @@ def load_replica(folder: Path) -> ReplicaScene:
     )
 
 
-def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
+def _params(folder: Path, names: Layout, photo: Path) -> PinholeParams:
     """Intrinsics from the ``cam_params.json`` in the scene folder or the folder above it, or those that all sequences
     of Semantic-NeRF have. Raises DataError if there are none, or a number is missing or out of range."""
     places = folder / "cam_params.json", folder.absolute().parent / "cam_params.json"
@@ -185,8 +150,8 @@ def _params(folder: Path, names: FileNames, photo: Path) -> PinholeParams:
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """The poses of a ``traj.txt``: float64 (F, 4, 4), camera-to-world, not yet checked to be rigid or finite. Blank
-    lines are ignored. Raises DataError if the file cannot be read, or a line is not 16 numbers."""
+    """The poses of a ``traj.txt``, float64 (F, 4, 4), not yet checked to be rigid or finite. Raises DataError if the
+    file cannot be read, or a line is not 16 numbers."""
     wanted = "expected one camera-to-world per line (16 numbers, a 4 x 4 matrix, row by row)"
     try:
         lines = read_text(path, 1 << 28).splitlines()

@@ -10,18 +10,39 @@ from typing import Any
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanagerConfig
-from pointsplat_ns.nerfstudio_plugin.optimizers import FallingRateConfig, FusedAdamConfig
+from pointsplat_ns.nerfstudio_plugin.optimizers import FusedAdamConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModelConfig
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import SplatfactoCpuPipelineConfig, SplatfactoCpuTrainer
 from pointsplat_ns.nerfstudio_plugin.trainer import StoppableTrainerConfig
 
 SPLATFACTO_STEPS = 30_000
 """Training steps that Splatfacto's schedules were chosen for."""
+
+
+@dataclass
+class FallingRate(SchedulerConfig):
+    """A learning rate that falls exponentially, in ``max_steps``, from one multiple of the optimiser's to another. A
+    training that resumes with another length has that length's rates."""
+
+    first: float = 1.0
+    last: float = 1.0
+    max_steps: int = 1
+
+    def setup(self) -> FallingRate:  # type: ignore[override]
+        """This one: it is its own scheduler."""
+        return self
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        """torch's scheduler of an optimiser; ``lr_init`` is the optimiser's rate, which it has already."""
+        ratio = self.last / self.first
+        return LambdaLR(optimizer, lambda step: self.first * ratio ** min(1.0, step / self.max_steps))
 
 
 @dataclass
@@ -35,7 +56,11 @@ class SplatfactoCpuTrainerConfig(StoppableTrainerConfig):
     by hand are not changed."""
 
     def setup(self, **kwargs) -> Trainer:
-        """Build the trainer with a copy of this config whose schedules are fitted."""
+        """Build the trainer with a copy of this config whose rates and limits of gradients are set.
+
+        A resumed run, and its schedules, end ``max_num_iterations`` after the step that it resumes from, or when
+        ``seconds`` are over, as if it had not been stopped.
+        """
         return self._target(fitted_schedules(self) if self.scale_schedules else self, **kwargs)
 
 
@@ -45,14 +70,11 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
 
     Model settings are changed only if they have Splatfacto's default values, learning-rate schedules only if they end
     at 30,000. ``refine_every``, over which gradients are gathered, shrinks only below 7,000 steps and never below 25.
-    The interval of the opacity reset is a multiple of it.
 
     Few steps can train only few Gaussians, and have to take them far. So the learning rates of Gaussians begin higher,
-    by the root of how many times shorter the run is, but at most eight times, as in a run of 470 steps, and end as
-    Splatfacto's. The gradient above which a Gaussian is split or duplicated grows by the root of that.
-
-    Gaussians are not split by their size on screen. The small pictures at the beginning make all of them look large:
-    a third of a scene came of that, and half of it was culled again.
+    by the root of how many times shorter the run is, but at most eight times, and end as Splatfacto's. The gradient
+    above which a Gaussian is split or duplicated grows by the root of that. Gaussians are not split by their size on
+    screen: the small pictures at the beginning make all of them look large.
     """
     length = max(1, config.first_step() + config.max_num_iterations)
     share = min(1.0, length / SPLATFACTO_STEPS)
@@ -74,7 +96,7 @@ def fitted_schedules(config: SplatfactoCpuTrainerConfig) -> SplatfactoCpuTrainer
         schedule = group["scheduler"]
         if haste > 1 and name in PARAMETERS and group == own[name]:
             last = 1.0 if schedule is None else schedule.lr_final / group["optimizer"].lr
-            group["scheduler"] = FallingRateConfig(first=haste, last=last, max_steps=length)
+            group["scheduler"] = FallingRate(first=haste, last=last, max_steps=length)
         elif isinstance(schedule, ExponentialDecaySchedulerConfig) and schedule.max_steps == SPLATFACTO_STEPS:
             schedule.max_steps = max(1, round(share * SPLATFACTO_STEPS))
             schedule.warmup_steps = round(share * schedule.warmup_steps)
@@ -101,12 +123,8 @@ def _optimizers() -> dict[str, dict[str, Any]]:
 
 
 def splatfacto_cpu_config() -> TrainerConfig:
-    """The ``splatfacto-cpu`` method.
-
-    It trains 7,000 steps, the shorter of the two lengths in the 3DGS paper: about an hour on a CPU with small photos.
-    It logs to tensorboard by default, as a viewer would compete for the CPU (``--vis viewer`` opens one; ``ns-viewer``
-    shows the result). Every 500 steps one held-out image is evaluated; ``ns-eval`` evaluates all of them.
-    """
+    """The ``splatfacto-cpu`` method: 7,000 steps, the shorter of the two lengths in the 3DGS paper, which take a CPU
+    about an hour with small photos. It logs to tensorboard by default, as a viewer would compete for the CPU."""
     return SplatfactoCpuTrainerConfig(
         method_name="splatfacto-cpu",
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
@@ -115,7 +133,6 @@ def splatfacto_cpu_config() -> TrainerConfig:
         steps_per_eval_batch=0,
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
-        mixed_precision=False,
         pipeline=SplatfactoCpuPipelineConfig(
             datamanager=LazyImageDatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True)),
             model=SplatfactoCpuModelConfig(),

@@ -1,8 +1,7 @@
 """Splatfacto on any torch device: nerfstudio's model with our rasterizer in place of gsplat's CUDA kernels.
 
-Config, densification, checkpoint keys, cropping, camera optimiser and bilateral grid are nerfstudio's own. Replaced is
-what needs CUDA or a download (the initialisation from seed points, the call of the rasterizer, LPIPS), and SSIM, by an
-implementation of the same formula in fewer operations.
+Replaced is what needs CUDA or a download (the initialisation from seed points, the call of the rasterizer, LPIPS), and
+SSIM, by an implementation of the same formula in fewer operations. All else is nerfstudio's own.
 """
 
 from __future__ import annotations
@@ -16,21 +15,21 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import BilateralGrid
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, random_quat_tensor
 from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torchmetrics.image import PeakSignalNoiseRatio
 
+from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.metrics.lpips import ReportedLpips
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.nerfstudio_plugin.cameras import VIEWER_BACKGROUND, RasterizerOptions, need_pinhole
-from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.seeds import distance_to_others, finite_seeds, random_seeds
 from pointsplat_ns.rasterizer.rendering import Colors
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.threads import one_thread
@@ -53,19 +52,13 @@ class SplatfactoCpuModelConfig(RasterizerOptions, SplatfactoModelConfig):
 
 
 class SplatfactoCpuModel(SplatfactoModel):
-    """Splatfacto that needs neither CUDA nor a network connection.
-
-    ``seed_points`` are positions (N, 3) in scene units and colours (N, 3) from 0 to 255. Rows that are not finite are
-    dropped, with a log line. If none is left, the scene starts from random points, as in Splatfacto.
-    """
+    """Splatfacto that needs neither CUDA nor a network connection. ``seed_points`` are positions (N, 3) in scene units
+    and colours (N, 3) from 0 to 255. If none is finite, the scene starts from random points, as in Splatfacto."""
 
     config: SplatfactoCpuModelConfig
 
     def populate_modules(self) -> None:
-        """Build what Splatfacto builds, without CUDA and without weights for LPIPS.
-
-        Splatfacto's own method is not called: it puts seed points on CUDA and downloads LPIPS.
-        """
+        """Build what Splatfacto builds; its own method puts seed points on CUDA and downloads LPIPS."""
         config = self.config
         self.strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
@@ -86,7 +79,11 @@ class SplatfactoCpuModel(SplatfactoModel):
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         self.seed_points = None if config.random_init else finite_seeds(self.seed_points)
-        self.gauss_params = self._seed_parameters(*(self.seed_points or random_seeds(config)))
+        if self.seed_points is None:
+            points = (torch.rand(config.num_random, 3, **FLOATS) - 0.5) * config.random_scale
+            self.gauss_params = self._seed_parameters(points, points[:0])
+        else:
+            self.gauss_params = self._seed_parameters(*self.seed_points)
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
         )
@@ -141,11 +138,8 @@ class SplatfactoCpuModel(SplatfactoModel):
         return super().get_training_callbacks(training_callback_attributes)
 
     def _adopt_optimizers(self, optimizers: Optimizers) -> None:
-        """Let the optimisers step this model's parameters.
-
-        nerfstudio builds the optimisers before it loads a checkpoint, and loading replaces the parameters. A resumed
-        Splatfacto would otherwise optimise parameters that are no longer rendered.
-        """
+        """Let the optimisers step this model's parameters. nerfstudio builds them before it loads a checkpoint, which
+        replaces the parameters: a resumed Splatfacto would optimise parameters that are no longer rendered."""
         for name, parameter in self.gauss_params.items():
             optimizer = optimizers.optimizers.get(name)
             if optimizer is None:
@@ -162,28 +156,46 @@ class SplatfactoCpuModel(SplatfactoModel):
         centres.grad = centres.absgrad = torch.zeros_like(centres)
         self.info["radii"] = torch.zeros_like(self.info["radii"])  # nothing was seen
 
-    def get_outputs(self, camera: Cameras | RayBundle) -> dict[str, Any]:
-        """Render one camera of shape (1,), on the model's device. Raises DataError if the camera is no pinhole.
-
-        Returns:
-            ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``, (3,) in training and (H, W, 3) in
-            evaluation; and ``depth`` (H, W, 1), in scene units along the viewing axis, or None in training unless
-            ``output_depth_during_training`` is set.
-        """
-        if not isinstance(camera, Cameras):
-            return {}
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]  # models of rays take those
+        """Render one camera of shape (1,): ``rgb`` (H, W, 3) in [0, 1]; ``accumulation`` (H, W, 1); ``background``,
+        (3,) in training and (H, W, 3) in evaluation; and ``depth`` (H, W, 1), in scene units along the viewing axis, or
+        None in training unless ``output_depth_during_training`` is set."""
         need_pinhole(camera)
-        params = self._visible_parameters()
-        if params is None:
-            width, height = int(camera.width.item()), int(camera.height.item())
-            return self.get_empty_outputs(width, height, self.background_color.to(self.device))
+        params = dict(self.gauss_params.items())
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(self.means).reshape(-1)
+            if not inside.any():
+                width, height = int(camera.width.item()), int(camera.height.item())
+                return self.get_empty_outputs(width, height, self.background_color.to(self.device))
+            params = {name: value[inside] for name, value in params.items()}
         camera_to_worlds = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
         factor = self._get_downscale_factor()
         width, height = int(camera.width.item()) // factor, int(camera.height.item()) // factor
         intrinsics = camera.get_intrinsics_matrices().to(self.device).clone()
         intrinsics[:, :2] /= factor
         with_depth = self.config.output_depth_during_training or not self.training
-        image, alpha, info = self._draw(params, camera_to_worlds, intrinsics, width, height, with_depth)
+        if self.config.sh_degree > 0:
+            colors: Colors = params["features_dc"], params["features_rest"]
+            degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+        else:
+            colors, degree = _sigmoid(params["features_dc"]), None
+        image, alpha, info = self.config.rasterize(
+            training=self.training,
+            means=params["means"],
+            quats=params["quats"],
+            scales=torch.exp(params["scales"]),
+            opacities=_sigmoid(params["opacities"][:, 0]),
+            colors=colors,
+            viewmats=viewmats_from_opengl(camera_to_worlds),
+            Ks=intrinsics,
+            width=width,
+            height=height,
+            packed=False,
+            render_mode="RGB+ED" if with_depth else "RGB",
+            sh_degree=degree,
+            absgrad=self.strategy.absgrad,
+            rasterize_mode=self.config.rasterize_mode,
+        )
         self.last_size = (height, width)
         if self.training:
             self.info = info
@@ -206,47 +218,6 @@ class SplatfactoCpuModel(SplatfactoModel):
             "background": background if self.training else background.expand(height, width, 3),
         }
 
-    def _visible_parameters(self) -> dict[str, Tensor] | None:
-        """All parameters, or in evaluation those inside the crop box; None if the box is empty."""
-        params = dict(self.gauss_params.items())
-        if self.crop_box is None or self.training:
-            return params
-        inside = self.crop_box.within(self.means).reshape(-1)
-        return {name: value[inside] for name, value in params.items()} if inside.any() else None
-
-    def _draw(
-        self,
-        params: dict[str, Tensor],
-        camera_to_worlds: Tensor,
-        intrinsics: Tensor,
-        width: int,
-        height: int,
-        with_depth: bool,
-    ) -> tuple[Tensor, Tensor, dict]:
-        """Image (1, H, W, 3 or 4), alpha (1, H, W, 1), and the info dictionary that densification needs."""
-        if self.config.sh_degree > 0:
-            colors: Colors = params["features_dc"], params["features_rest"]
-            degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
-        else:
-            colors, degree = _sigmoid(params["features_dc"]), None
-        return self.config.rasterize(
-            training=self.training,
-            means=params["means"],
-            quats=params["quats"],
-            scales=torch.exp(params["scales"]),
-            opacities=_sigmoid(params["opacities"][:, 0]),
-            colors=colors,
-            viewmats=viewmats_from_opengl(camera_to_worlds),
-            Ks=intrinsics,
-            width=width,
-            height=height,
-            packed=False,
-            render_mode="RGB+ED" if with_depth else "RGB",
-            sh_degree=degree,
-            absgrad=self.strategy.absgrad,
-            rasterize_mode=self.config.rasterize_mode,
-        )
-
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
@@ -259,3 +230,43 @@ def _sigmoid(values: Tensor) -> Tensor:
     """torch's, whose rounding depends on the number of threads, on one."""
     with one_thread():
         return torch.sigmoid(values)
+
+
+def distance_to_others(points: Tensor, k: int) -> Tensor:
+    """Mean distance (N, 1) from each point (N, 3) to its ``k`` nearest other positions, float32 and positive.
+
+    Points at the same position count once. With fewer than ``k`` other positions, the distance to the farthest is
+    repeated; with none, the result is 0.01 scene units.
+    """
+    places, place_of = torch.unique(points, dim=0, return_inverse=True)
+    if len(places) < 2:
+        return torch.full((len(points), 1), 0.01, **FLOATS)
+    distances = nearest(places, k + 1)[0][:, 1:]
+    missing = distances[:, -1:].expand(-1, k - distances.shape[1])
+    # Distinct positions can be so close that the distance is zero in float32.
+    distances = torch.cat([distances, missing], dim=1).clamp(min=torch.finfo(torch.float32).tiny).float()
+    return distances.mean(dim=1, keepdim=True)[place_of]
+
+
+def finite_seeds(seeds: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
+    """Positions (N, 3) and colours (N, 3) as float32 without rows that are not finite; None if nothing is left.
+
+    If all colours are black they are unknown, (0, 3), as in COLMAP models whose points were triangulated without
+    photos. Renders clamp colours at black, where they have no gradient: the scene would stay black.
+    """
+    if seeds is None:
+        return None
+    points, colors = (value.detach().float().cpu() for value in seeds)
+    finite = points.isfinite().all(dim=1)
+    if len(colors) > 0:
+        finite &= colors.isfinite().all(dim=1)
+        colors = colors[finite]
+    if not finite.all():
+        CONSOLE.log(f"{int((~finite).sum())} of {len(points)} seed points are not finite and were dropped")
+    if not finite.any():
+        CONSOLE.log("no seed points are left; a training starts from random ones")
+        return None
+    if len(colors) > 0 and not colors.any():
+        CONSOLE.log("all seed points are black, as where colours are unknown; a training starts from random colours")
+        colors = colors[:0]
+    return points[finite].clone(), colors.clone()

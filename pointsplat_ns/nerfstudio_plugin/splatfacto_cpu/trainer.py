@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.nerfstudio_plugin.datamanager import LazyImageDatamanager
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuTrainerConfig
 
 
-_LISTS = ("train_unseen_cameras", "eval_unseen_cameras")
+FRAMES_TO_COME = ("train_unseen_cameras", "eval_unseen_cameras")
 """Attributes of the datamanager: the frames that are still to come before any is repeated."""
 
 
 @dataclass
 class SplatfactoCpuPipelineConfig(VanillaPipelineConfig):
-    """nerfstudio's pipeline, with an evaluation that is always valid JSON"""
+    """nerfstudio's pipeline"""
 
     _target: type = field(default_factory=lambda: SplatfactoCpuPipeline)
 
@@ -43,12 +43,9 @@ class SplatfactoCpuPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Mean metrics over the held-out frames; a DataError if no frame is held out.
-
-        Given a ``step``, by the trainer, whose log takes only finite numbers, other metrics are left out. Without it,
-        as in ``ns-eval``, they are None, and ``lpips_note`` says why LPIPS is missing. The standard deviation of a
-        single image is None.
-        """
+        """Mean metrics over the held-out frames; a DataError if no frame is held out. Given a ``step``, by the trainer,
+        whose log takes only finite numbers, other metrics are left out. Without it, as in ``ns-eval``, they are None,
+        and ``lpips_note`` says why LPIPS is missing."""
         if not self.datamanager.eval_dataset:
             raise DataError(
                 f"{self.datamanager.get_datapath()}: no frame is held out, so there is nothing to evaluate on; "
@@ -75,74 +72,63 @@ class SplatfactoCpuTrainer(StoppableTrainer):
         with tiny_as_zero():
             super().train()
 
-    def update(self, step: int, names: list[str], skipped: bool) -> None:
+    def update(self, step: int, skipped: bool) -> None:
         """As the base class; densification gathers nothing of a skipped step."""
         if skipped:
             self.pipeline.model.forget_step()
-        super().update(step, names, skipped)
+        super().update(step, skipped)
 
     def source_of(self, metrics: dict[str, Any]) -> str:
         """Name of the photo of the latest step."""
         return self.pipeline.datamanager.latest_photo
 
     def state_to_resume(self) -> dict[str, Any]:
-        """Random numbers to come, the order of the photos, and what densification has gathered."""
-        return training_state(self.pipeline)
+        """Random numbers to come, the order of the photos, and what densification has gathered, as plain values and
+        tensors that torch loads with ``weights_only``."""
+        manager: Any = self.pipeline.datamanager
+        kind, keys, *rest = np.random.get_state()
+        state: dict[str, Any] = {
+            "torch": torch.get_rng_state(),
+            "python": random.getstate(),
+            "numpy": [kind, torch.from_numpy(np.asarray(keys, np.int64)), *rest],
+            "densification": dict(self.pipeline.model.strategy_state),
+            **{name: list(getattr(manager, name)) for name in FRAMES_TO_COME},
+        }
+        if hasattr(manager, "random_generator"):  # of the order of the training frames
+            state["frames"] = manager.random_generator.getstate()
+        return state
 
     def _load_checkpoint(self) -> None:
+        """As nerfstudio's; then put back :meth:`state_to_resume`. Of another number of photos, their order is left
+        alone."""
         super()._load_checkpoint()
         folder, path = self.config.load_dir, self.config.load_checkpoint
         if folder is not None:
             path = folder / f"step-{self._start_step - 1:09d}.ckpt"
         state = None if path is None else torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(STATE)
-        if state is not None:  # those of nerfstudio's own methods have none
-            restore_training_state(self.pipeline, state)
-
-
-def training_state(pipeline: Pipeline) -> dict[str, Any]:
-    """Random numbers to come, the order of the frames, and what densification has gathered, as plain values and tensors
-    that torch loads with ``weights_only``."""
-    manager: Any = pipeline.datamanager
-    kind, keys, *rest = np.random.get_state()
-    state: dict[str, Any] = {
-        "torch": torch.get_rng_state(),
-        "python": random.getstate(),
-        "numpy": [kind, torch.from_numpy(np.asarray(keys, np.int64)), *rest],
-        "densification": dict(pipeline.model.strategy_state),
-        **{name: list(getattr(manager, name)) for name in _LISTS},
-    }
-    if hasattr(manager, "random_generator"):  # of the order of the training frames
-        state["frames"] = manager.random_generator.getstate()
-    return state
-
-
-def restore_training_state(pipeline: Pipeline, state: Mapping[str, Any]) -> None:
-    """Put back what :func:`training_state` gave. Of another number of photos, their order is left alone."""
-    manager: Any = pipeline.datamanager
-    torch.set_rng_state(state["torch"])
-    random.setstate(state["python"])
-    kind, keys, *rest = state["numpy"]
-    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
-    model = pipeline.model
-    for name, value in state["densification"].items():
-        model.strategy_state[name] = value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
-    numbers = (len(manager.train_dataset), len(manager.eval_dataset))
-    lists = [state[name] for name in _LISTS]
-    if all(0 <= index < number for number, indices in zip(numbers, lists, strict=True) for index in indices):
-        for name, indices in zip(_LISTS, lists, strict=True):
-            setattr(manager, name, list(indices))
-        if "frames" in state and hasattr(manager, "random_generator"):
-            manager.random_generator.setstate(state["frames"])
+        if state is None:  # those of nerfstudio's own methods have none
+            return
+        torch.set_rng_state(state["torch"])
+        random.setstate(state["python"])
+        kind, keys, *rest = state["numpy"]
+        np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+        model, manager = self.pipeline.model, self.pipeline.datamanager
+        for name, value in state["densification"].items():
+            model.strategy_state[name] = value.clone().to(model.device) if isinstance(value, torch.Tensor) else value
+        numbers = len(manager.train_dataset), len(manager.eval_dataset)
+        lists = [state[name] for name in FRAMES_TO_COME]
+        if all(0 <= index < number for number, indices in zip(numbers, lists, strict=True) for index in indices):
+            for name, indices in zip(FRAMES_TO_COME, lists, strict=True):
+                setattr(manager, name, list(indices))
+            if "frames" in state and hasattr(manager, "random_generator"):
+                manager.random_generator.setstate(state["frames"])
 
 
 @contextmanager
 def tiny_as_zero() -> Iterator[None]:
-    """Let this thread, and those it starts, take floats below the smallest normal one (1e-38) as 0 while the context is
-    open.
-
-    Many processors take ten times as long for such numbers. Adam's averages are full of them where a Gaussian has not
-    been seen for 800 steps: they fall by a tenth with each.
-    """
+    """Within, this thread, and those it starts, take floats below the smallest normal one (1e-38) as 0. Many processors
+    take ten times as long for such numbers. Adam's averages are full of them where a Gaussian has not been seen for 800
+    steps: they fall by a tenth with each."""
     before = takes_tiny_as_zero()
     torch.set_flush_denormal(True)
     try:

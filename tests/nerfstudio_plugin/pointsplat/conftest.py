@@ -1,7 +1,6 @@
 """Trainings of the refiner and evaluations that several modules look at."""
 
 from pathlib import Path
-from unittest import mock
 
 import pytest
 from nerfstudio.utils.eval_utils import eval_setup
@@ -19,27 +18,16 @@ def poses_sampled_once():
 
 @pytest.fixture(scope="session")
 def trained(trained_walls, run_training, tmp_path_factory):
-    """A short training on wall-a with wall-b held out: its config, its trainer, and which scenes gave photos."""
+    """A short training on wall-a with wall-b held out: its config and its trainer."""
     config = fast_config(trained_walls, tmp_path_factory.mktemp("refined"))
     config.pipeline.datamanager.eval_scenes = ("wall-b",)
     config.steps_per_eval_image = 4
-    from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PointSplatModel
-
-    used, losses = [], PointSplatModel.losses
-
-    def recorded(self, index, frames):
-        used.append((self.training, index))
-        return losses(self, index, frames)
-
-    with mock.patch.object(PointSplatModel, "losses", recorded):
-        trainer, _ = run_training(config)
-    return config, trainer, used
+    return config, run_training(config)[0]
 
 
 @pytest.fixture(scope="session")
 def evaluated(trained):
-    config, _, _ = trained
-    return eval_setup(config.get_base_dir() / "config.yml")[1]
+    return eval_setup(trained[0].get_base_dir() / "config.yml")[1]
 
 
 @pytest.fixture(scope="session")

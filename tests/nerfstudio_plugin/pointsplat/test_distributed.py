@@ -1,6 +1,7 @@
-"""Two processes that train together do what one does with twice the scenes an update. Run as a program: the two."""
+"""Two processes that torchrun starts do what one does with twice the scenes an update. Run as a program: the two."""
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,12 +11,11 @@ from unittest import mock
 
 import pytest
 import torch
-import torch.distributed as dist
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from broken_steps import broken
-from making import QUICK_START, REPOSITORY, box_room, dense_config, quick_start, views_sampled_once
+from making import QUICK_START, REPOSITORY, box_room, dense_config, equal, views_sampled_once
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
@@ -40,14 +40,11 @@ def config_of(data: Path, output_dir: Path, steps: int):
     return config
 
 
-def write_rooms(folder: Path) -> None:
-    for seed, name in enumerate("abc"):
-        write_ply(box_room(seed, 600, smooth=True), folder / f"{name}.ply")
-
-
-def train(config, world_size: int = 1, judged: bool = False) -> dict:
-    """Losses, gradients of the last update, weights and, if asked for, the evaluation of a training."""
-    trainer = config.setup(local_rank=0, world_size=world_size)
+def train(config, judged: bool = False) -> dict:
+    """Losses, gradients of the last update, weights and, if asked for, the evaluation of a training, which is set up as
+    by ``ns-train``."""
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     losses, iteration = [], trainer.train_iteration
 
@@ -77,14 +74,6 @@ def saving(data: Path, output_dir: Path, steps: int):
     return config
 
 
-def resumed(rooms: Path, folder: Path, name: str, rank: int) -> list[dict]:
-    """A training of two processes, and the end of it once more from a checkpoint."""
-    whole = train(saving(rooms, folder / f"{name}{rank}", 4), world_size=2)
-    rest = saving(rooms, folder / f"{name} on {rank}", 1)
-    rest.load_dir, rest.load_step = folder / f"{name}0" / "refiner" / "pointsplat" / "now" / "nerfstudio_models", 2
-    return [whole, train(rest, world_size=2)]
-
-
 @contextmanager
 def two_scenes_a_step() -> Iterator[None]:
     """Within, a step of one process takes the scenes of the two processes, and the mean of their losses."""
@@ -100,13 +89,16 @@ def two_scenes_a_step() -> Iterator[None]:
         yield
 
 
-def work(rank: int, folder: Path) -> None:
-    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
-    found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), world_size=2, judged=True)
+def work(rank: int, folder: Path, port: str) -> None:
+    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "RANK": str(rank)}
+    os.environ.update(place, LOCAL_RANK=str(rank), TORCHELASTIC_RUN_ID="as torchrun does")
+    found = train(config_of(folder / "rooms", folder / f"out{rank}", UPDATES), judged=True)
     with broken("nan", BROKEN[0]), broken("gradient", BROKEN[1]):
-        found["skipping"] = resumed(folder / "rooms", folder, "skipping", rank)
+        whole = train(saving(folder / "rooms", folder / f"skipping{rank}", 4))
+        rest = saving(folder / "rooms", folder / f"rest{rank}", 1)
+        rest.load_dir, rest.load_step = folder / "skipping0/refiner/pointsplat/now/nerfstudio_models", 2
+        found["skipping"] = [whole, train(rest)]
     torch.save(found, folder / f"found{rank}.pt")
-    dist.destroy_process_group()
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +106,12 @@ def together(tmp_path_factory):
     """What the two processes found, and what one process finds with two scenes an update."""
     folder = tmp_path_factory.mktemp("parallel")
     (folder / "rooms").mkdir()
-    write_rooms(folder / "rooms")
+    for seed, name in enumerate("abc"):
+        write_ply(box_room(seed, 600, smooth=True), folder / "rooms" / f"{name}.ply")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = str(server.getsockname()[1])
     pair = subprocess.Popen(
-        [sys.executable, __file__, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        [sys.executable, __file__, folder, port], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (QUICK_START, REPOSITORY, QUICK_START.parent)))},
     )  # fmt: skip
     try:
@@ -129,7 +124,16 @@ def together(tmp_path_factory):
         pair.kill()
     assert pair.returncode == 0, text
     found = [torch.load(folder / f"found{rank}.pt") for rank in (0, 1)]
+    assert text.count("rasterizer: ") == 3, "the first process alone says it, once a training"
     return found, alone
+
+
+def differ(found: dict, wanted: dict) -> float:
+    """The largest difference of tensors, as shares of the largest value of each: Adam's first steps have the size of
+    the rate, whatever that of the gradient, so that rounding shows where a gradient is nearly nothing."""
+    return max(
+        float((found[name] - value).abs().max() / value.abs().max().clamp_min(1e-6)) for name, value in wanted.items()
+    )
 
 
 def test_two_processes_train_as_one_with_twice_the_batch(together):
@@ -137,31 +141,25 @@ def test_two_processes_train_as_one_with_twice_the_batch(together):
     means = [(ours + theirs) / 2 for ours, theirs in zip(found[0]["losses"], found[1]["losses"], strict=True)]
     assert means == pytest.approx(alone["losses"], rel=1e-5)  # float32 sums in another order, through two updates
     assert len(set(alone["losses"])) == UPDATES and len(alone["gradients"]) == len(alone["weights"])
-    for key, tolerance in (("gradients", 1e-3), ("weights", 1e-3)):
-        for name, wanted in alone[key].items():
-            assert torch.equal(found[0][key][name], found[1][key][name]), name
-            # Adam's first steps have the size of the rate, whatever that of the gradient: rounding shows where a
-            # gradient is nearly nothing. Shares of the tensor's largest value.
-            error = (found[0][key][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
-            assert error < tolerance, (key, name, float(error))
+    for key in ("gradients", "weights"):
+        assert equal(found[0][key], found[1][key]) and differ(found[0][key], alone[key]) < 1e-3
 
 
 def test_each_process_evaluates_its_share_and_the_first_alone_writes(together):
     found, alone = together
     assert found[0]["report"] == found[1]["report"] and list(found[0]["report"]) == ["a", "b", "c"]
     assert found[0]["report"] == pytest.approx(alone["report"], abs=1e-2)  # dB, of weights that differ by rounding
-    assert {"refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"} <= set(found[0]["files"])
-    assert not {"refiner.safetensors"} & set(found[1]["files"]) and not [f for f in found[1]["files"] if "ckpt" in f]
+    assert found[0]["files"] == ["config.yml", "refiner.safetensors", f"step-{UPDATES - 1:09d}.ckpt"]
+    assert found[1]["files"] == []
 
 
 def test_an_interrupted_training_ends_as_an_unbroken_one(together):
     for part in together[0]:
         whole, rest = part["skipping"]
         assert str(rest["losses"]) == str(whole["losses"][3:])
-        for tensor, value in whole["weights"].items():
-            assert torch.equal(rest["weights"][tensor], value), tensor
+        assert equal(rest["weights"], whole["weights"])
     ours, theirs = (part["skipping"][0] for part in together[0])
-    assert all(torch.equal(ours["weights"][n], theirs["weights"][n]) for n in ours["weights"])
+    assert equal(ours["weights"], theirs["weights"])
 
 
 def test_what_one_process_cannot_use_all_leave_out(together):
@@ -170,31 +168,9 @@ def test_what_one_process_cannot_use_all_leave_out(together):
         whole = part["skipping"][0]
         assert [value != value for value in whole["losses"]] == [False, rank == 1, False, False]
         assert sum(whole["skipped"].values()) == 2, "the one broken scene of each such step"
-        for name, wanted in alone["skipping"]["weights"].items():
-            error = (whole["weights"][name] - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
-            assert error < 1e-3, (name, float(error))  # as above
+        assert differ(whole["weights"], alone["skipping"]["weights"]) < 1e-3
     assert found[0]["skipping"][0]["skipped"] == found[1]["skipping"][0]["skipped"]
     assert sum(alone["skipping"]["skipped"].values()) == 2
-
-
-def test_ns_train_under_torchrun_is_one_training(tmp_path):
-    write_rooms(tmp_path / "rooms")
-    asked = [
-        *("--data", tmp_path / "rooms", "--output-dir", tmp_path / "out", "--experiment-name", "pair"),
-        *("--max-num-iterations", 2, "--steps-per-eval-image", 0, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.sampled-poses", 5, "--pipeline.datamanager.sampled-size", 32, 24),
-        *("--pipeline.model.size", "tiny", "--pipeline.model.by", "paper", "--pipeline.model.lpips-weight", 0),
-    ]
-    run = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "nerfstudio.scripts.train", "pointsplat")
-    done = subprocess.run(
-        [sys.executable, *run, *map(str, asked)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=600,
-        env=quick_start(),
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout.decode()
-    (folder,) = (tmp_path / "out" / "pair" / "pointsplat").iterdir()
-    found = {path.name for path in folder.rglob("*") if "events" not in path.name}
-    assert found == {"config.yml", "refiner.safetensors", "nerfstudio_models", f"step-{1:09d}.ckpt"}
-    assert done.stdout.decode().count("rasterizer: ") == 1
 
 
 def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
@@ -215,6 +191,6 @@ def test_several_processes_on_a_cpu_are_started_by_torchrun(tmp_path):
 if __name__ == "__main__":
     child = os.fork()  # nothing has been computed, so there are no threads yet
     with changed(QUICK), views_sampled_once():
-        work(0 if child else 1, Path(sys.argv[1]))
+        work(0 if child else 1, Path(sys.argv[1]), sys.argv[2])
     if child:
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
