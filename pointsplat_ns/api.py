@@ -230,7 +230,6 @@ def lod(
     folder: str | Path | None = None,
     stream: bool = False,
     tiles: bool = False,
-    at: str | None = None,
     force: bool = False,
     progress: bool | Progress = False,
 ) -> Levels:
@@ -248,7 +247,7 @@ def lod(
         folder: output folder for the levels and a manifest; see :meth:`Levels.save`. A name that ends in
             .rad is a file of all levels; see :meth:`Levels.save_paged`.
         stream: write a streamed SOG instead; see :meth:`Levels.save_stream`.
-        tiles, at: write 3D Tiles instead, and where the scene lies on the Earth; see :meth:`Levels.save_tiles`.
+        tiles: write 3D Tiles instead; see :meth:`Levels.save_tiles`.
         force: overwrite existing files in ``folder``.
 
     Returns:
@@ -269,7 +268,7 @@ def lod(
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
     PruneRequest(1.0, sh=sh)
-    output = LevelOutput.of(folder, stream, tiles, at, up, force)
+    output = LevelOutput.of(folder, stream, tiles, force)
     if output is not None:
         output.check(len(budgets))
     dense, view_source = read_source(scene, Looking(views, resolution, up, data))

@@ -21,7 +21,6 @@ def lod(
     output: options.Output = None,
     stream: bool = False,
     tiles: bool = False,
-    at: str | None = None,
     sh: options.Bands = "all",
     poses: options.Poses = None,
     resolution: options.Resolution = None,
@@ -49,9 +48,6 @@ def lod(
             room_tiles. A name that ends in .rad is a file for Spark.
         stream: write a streamed SOG (PlayCanvas, SuperSplat, Babylon). The scene itself is its finest level.
         tiles: write 3D Tiles of glTF with SPZ (CesiumJS). The scene itself is their finest level.
-        at: where tiles lie on the Earth: the UTM zone of the scene's coordinates (EPSG:32632), or the latitude,
-            longitude and height of its origin in degrees and metres (48.86,2.29,35; --at=-33.9,... in the south), with
-            up turned to the zenith. By default they have the frame of the scene's file.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
         json_output: print the manifest, and nothing else on standard output.
     """
@@ -67,7 +63,7 @@ def lod(
     with fixed_threads(threads):
         made = ps.lod(
             scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
-            data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force, progress=True,
+            data=data, folder=folder, stream=stream, tiles=tiles, force=force, progress=True,
         )  # fmt: skip
     if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})

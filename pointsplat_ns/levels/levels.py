@@ -145,25 +145,10 @@ class Levels:
         :func:`~pointsplat_ns.levels.paged.write_paged`. Returns the number of its Gaussians."""
         return write_paged(path, self.scenes, self.parents, progress)
 
-    def save_tiles(
-        self,
-        folder: str | Path,
-        at: str | None = None,
-        up: str | None = None,
-        force: bool = False,
-        progress: Progress = silent,
-    ) -> list[int]:
+    def save_tiles(self, folder: str | Path, force: bool = False, progress: Progress = silent) -> list[int]:
         """Write the levels as 3D Tiles, as ``pointsplat lod --tiles`` does; see
-        :func:`~pointsplat_ns.levels.tiles.write_tiles`. Returns the number of Gaussians of each.
-
-        Args:
-            folder: created if it is missing.
-            at: where the scene lies on the Earth, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; by default the
-                tiles have the frame of the scene's file.
-            up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
-            force, progress: as for :meth:`save_stream`.
-        """
-        about, matrix = placed(self.scenes, self.dense, at, up)
+        :func:`~pointsplat_ns.levels.tiles.write_tiles`. Returns the number of Gaussians of each."""
+        about, matrix = placed(self.scenes)
         return write_tiles(
             folder, about, [of.cpu() for of in self.parents], self._pixel_sizes(), matrix, force, progress
         )

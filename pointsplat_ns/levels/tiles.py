@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.earth import Place
-from pointsplat_ns.geometry.transforms import smallest_turn
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.glb_tile import TILE_EXTENSIONS, encode_tile
@@ -23,8 +21,6 @@ from pointsplat_ns.io.offsets import from_centre
 from pointsplat_ns.io.scene import warn_of_losses
 from pointsplat_ns.levels.folder import check_folder
 from pointsplat_ns.levels.tree import Cell, cells
-from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.upright import known_up, up_named
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
 
@@ -35,30 +31,13 @@ PIXELS = 16.0
 """Pixels of error at which CesiumJS refines a tile, unless it is told another number."""
 
 
-def placed(
-    levels: Sequence[Gaussians], dense: Gaussians, at: str | None, up: str | None
-) -> tuple[list[Gaussians], Tensor]:
-    """Levels, float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64 from there to the
-    frame of tiles: that of the scene's file, or the Earth's.
-
-    Args:
-        levels: the finest first.
-        dense: the scene that they were made of.
-        at: where it lies, see :meth:`~pointsplat_ns.geometry.earth.Place.parse`; None for the frame of its file.
-        up: the axis that is up, if ``at`` is a point; by default the scene's own, or estimated.
-    """
+def placed(levels: Sequence[Gaussians]) -> tuple[list[Gaussians], Tensor]:
+    """Levels, the finest first, as float32 on the CPU, about the middle of the coarsest, and the matrix (4, 4) float64
+    from there to the frame of the scene's file."""
     scenes = [scene.detach().to("cpu", torch.float32) for scene in levels]
     middle = from_centre(scenes[-1]).offset or (0.0, 0.0, 0.0)
-    matrix, point = torch.eye(4, **DOUBLES), torch.tensor(middle, **DOUBLES)
-    place = None if at is None else Place.parse(at)
-    if place is None:
-        matrix[:3, 3] = point
-    elif place.zone is None:
-        direction = (known_up(up_named(up), dense) or Sampler(dense).up).direction.double().cpu()
-        turn = smallest_turn(direction, torch.tensor([0.0, 0.0, 1.0], **DOUBLES))
-        matrix = place.frame(point - torch.tensor(dense.offset or (0.0, 0.0, 0.0), **DOUBLES), turn)
-    else:
-        matrix = place.frame(point, torch.eye(3, **DOUBLES))
+    matrix = torch.eye(4, **DOUBLES)
+    matrix[:3, 3] = torch.tensor(middle, **DOUBLES)
     return [scene.at_offset(middle).replace(offset=None) for scene in scenes], matrix
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.io.formats.sog_stream import STREAM_META, read_sog_stream
 from pointsplat_ns.io.outputs import need_folder, need_writable
 from pointsplat_ns.levels.folder import check_folder, level_names
@@ -26,25 +25,18 @@ class LevelOutput:
     path: Path
     """A folder; of the form "paged" a file."""
     form: Form
-    at: str | None
-    """Where the scene lies on the Earth, for tiles."""
-    up: str | None
     force: bool
 
     @staticmethod
-    def of(
-        path: str | Path | None, stream: bool, tiles: bool, at: str | None, up: str | None, force: bool
-    ) -> LevelOutput | None:
+    def of(path: str | Path | None, stream: bool, tiles: bool, force: bool) -> LevelOutput | None:
         """The output of options of :func:`pointsplat_ns.lod`; None if nothing is written."""
-        if stream and tiles or at is not None and not tiles:
-            raise PointSplatError("expected either a stream or 3D Tiles, and a place on the Earth with tiles alone")
-        if at is not None:
-            Place.parse(at)
+        if stream and tiles:
+            raise PointSplatError("expected either a stream or 3D Tiles")
         if path is None:
             return None
         paged = Path(path).suffix.lower() == ".rad"
         form: Form = "stream" if stream else "tiles" if tiles else "paged" if paged else "folder"
-        return LevelOutput(Path(path), form, at, up, force)
+        return LevelOutput(Path(path), form, force)
 
     def check(self, count: int) -> None:
         """Check that ``count`` levels can be written."""
@@ -62,7 +54,7 @@ class LevelOutput:
         if self.form == "paged":
             levels.save_paged(self.path, progress)
         elif self.form == "tiles":
-            levels.save_tiles(self.path, self.at, self.up, self.force, progress)
+            levels.save_tiles(self.path, self.force, progress)
         else:
             levels.save(self.path, self.force)
         return levels

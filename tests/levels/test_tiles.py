@@ -15,7 +15,6 @@ from nested_levels import nested, rows_of
 import pointsplat_ns as ps
 from making import ball, normal_scene
 from pointsplat_ns.cli import main
-from pointsplat_ns.geometry.earth import Place
 from pointsplat_ns.levels.errors import pixel_size_for
 from pointsplat_ns.levels.tiles import write_tiles
 
@@ -118,38 +117,19 @@ def test_a_tileset_says_what_viewers_ask_for(tmp_path):
         assert (np.abs(inner[:3] - outer[:3]) + inner[3::4] <= outer[3::4] + 1e-12).all()
 
 
-@pytest.mark.parametrize(
-    ("at", "offset", "up"),
-    [
-        (None, None, None),
-        (None, (1e6, -2e6, 3e5), None),
-        ("EPSG:32632", (513_000.0, 5_403_000.0, 300.0), None),
-        ("48.78,9.18,300", None, "-y"),
-        ("48.78,9.18,300", (1e6, 0.0, 0.0), "z"),
-    ],
-)
-def test_tiles_lie_where_the_scene_does(at, offset, up, tmp_path):
-    scene = ball(300, opacity=1.0, bright=1.0).replace(offset=offset, up=up)
+@pytest.mark.parametrize("offset", [None, (1e6, -2e6, 3e5)])
+def test_tiles_lie_where_the_scene_does(offset, tmp_path):
+    scene = ball(300, opacity=1.0, bright=1.0).replace(offset=offset)
     views = ps.sample_views(scene, 2, 48, 36)
-    ps.lod(scene, ["100%", "10%"], views=views, folder=tmp_path / "out", tiles=True, at=at)
+    ps.lod(scene, ["100%", "10%"], views=views, folder=tmp_path / "out", tiles=True)
     tileset, tiles = tiles_of(tmp_path / "out")
     matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
     paths = [tmp_path / "out" / tile["content"]["uri"] for tile, _ in tiles if tile["geometricError"] == 0]
     contents = [read_tile(path) for path in paths]
     found = torch.from_numpy(np.concatenate([part["positions"] for part in contents]) @ matrix[:3, :3].T)
     found += torch.from_numpy(matrix[:3, 3])
-    means = scene.means.double()
-    turns = {None: torch.eye(3), "z": torch.eye(3), "-y": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
-    if at is None:
-        wanted = means + torch.tensor(offset or (0.0, 0.0, 0.0), dtype=torch.float64)
-    elif at.startswith("EPSG"):
-        about = Place.parse(at).frame(torch.tensor(offset, dtype=torch.float64), torch.eye(3).double())
-        wanted = means @ about[:3, :3].T + about[:3, 3]
-    else:
-        about = Place.parse(at).frame(torch.zeros(3, dtype=torch.float64), turns[up].double())
-        wanted = means @ about[:3, :3].T + about[:3, 3]
-    # A zone's scale is 0.9996 in its middle, and heights have none: 2 units of height differ by 0.0008.
-    most = float(contents[0]["step"]) + (1e-3 if at and at.startswith("EPSG") else 1e-6)
+    wanted = scene.means.double() + torch.tensor(offset or (0.0, 0.0, 0.0), dtype=torch.float64)
+    most = float(contents[0]["step"]) + 1e-6
     middle = wanted.mean(0)
     apart = torch.cdist(found - middle, wanted - middle, compute_mode="donot_use_mm_for_euclid_dist")
     assert len(found) == 300 and float(apart.min(dim=1).values.max()) <= most
@@ -169,8 +149,6 @@ def test_older_tiles_need_force_and_stay_when_writing_fails(tmp_path, monkeypatc
     ps.save(normal_scene(20), tmp_path / "room.ply")
     for options, words in (
         (["--tiles", "--stream"], "either a stream or 3D Tiles"),
-        (["--at", "1,2"], "with tiles alone"),
-        (["--tiles", "--at", "Paris"], "expected a UTM zone"),
         (["--tiles", "-o", str(tmp_path / "a.rad")], "expected the name of a folder"),
     ):
         with pytest.raises(SystemExit):
