@@ -88,7 +88,7 @@ class Case:
         marks.append(now())
         torch.autograd.grad(drawn, leaves, (self.grads[0], -self.grads[1]))
         marks.append(now())
-        footprints.tiles(footprints.whole)
+        footprints.tiles()
         marks.append(now())
         numbers, calls = torch.full((2**12,), -1.0), 200
         with one_thread():

@@ -17,9 +17,9 @@ from pointsplat_ns.rasterizer import eager
 from pointsplat_ns.rasterizer.constants import TILE
 from pointsplat_ns.rasterizer.eager import Inputs
 from pointsplat_ns.rasterizer.eager import inputs_of as inputs_of  # part of this module's interface, as chain
+from pointsplat_ns.rasterizer.ellipses import Grid, TileList
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS, gather, mean_slopes, moments
 from pointsplat_ns.rasterizer.quadratics import chain as chain
-from pointsplat_ns.rasterizer.tiles import Footprints, TileList
 
 
 class Tiles(NamedTuple):
@@ -53,12 +53,13 @@ class Frame:
     LONGEST = 1024
     """Largest number of Gaussians in a chunk."""
 
-    def __init__(self, footprints: Footprints, tiles: TileList, dtype: torch.dtype):
+    def __init__(self, grid: Grid, tiles: TileList, dtype: torch.dtype):
         lengths = tiles.offsets[1:] - tiles.offsets[:-1]
-        self.width, self.height, self.tiles = footprints.width, footprints.height, lengths.numel()
+        self.grid, self.tiles = grid, lengths.numel()
         self.occupied = int((lengths > 0).sum())
         ids = torch.sort(lengths, descending=True, stable=True).indices[: self.occupied]
-        x, y = (centre.to(dtype) for centre in tiles.centres(ids))
+        row = torch.div(ids, grid.columns, rounding_mode="floor")
+        x, y = ((place * TILE + TILE // 2).to(dtype) for place in (ids - row * grid.columns, row + tiles.top))
         self.sorted = Tiles(ids, x, y, tiles.offsets[ids], tiles.offsets[ids + 1])
         self.pairs_count = tiles.gaussians.numel()
         self.gaussians = F.pad(tiles.gaussians, (0, 1), value=tiles.order.numel())  # the last pair is padding
@@ -76,8 +77,8 @@ class Frame:
     def inside(self, tiles: Tiles) -> Tensor:
         """1 for the pixels of tiles (B,) that are in the image, (B, 64)."""
         axis = torch.arange(TILE, device=tiles.x.device, dtype=torch.int64) - (TILE // 2)
-        columns = tiles.x[:, None] + axis < self.width
-        rows = tiles.y[:, None] + axis < self.height
+        columns = tiles.x[:, None] + axis < self.grid.width
+        rows = tiles.y[:, None] + axis < self.grid.height
         return (rows[:, :, None] & columns[:, None, :]).view(-1, PIXELS).to(tiles.x.dtype)
 
     def pairs(self, tiles: Tiles, first: int, size: int) -> Tensor:
@@ -134,10 +135,10 @@ def _blend_block(
 
 
 def blend_region(
-    footprints: Footprints, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
+    grid: Grid, tiles: TileList, inputs: Inputs, image: Tensor, final: Tensor, keep_tape: bool
 ) -> Tape | None:
     """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
-    frame = Frame(footprints, tiles, image.dtype)
+    frame = Frame(grid, tiles, image.dtype)
     if frame.occupied < frame.tiles:
         image.zero_()
         final.fill_(1.0)
@@ -192,7 +193,7 @@ def _blend_block_backward(
 
 
 def differentiate_region(
-    footprints: Footprints,
+    grid: Grid,
     tiles: TileList,
     inputs: Inputs,
     tape: Tape,

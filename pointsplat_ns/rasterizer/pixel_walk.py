@@ -52,9 +52,9 @@ def sum_over_pixels(
     """
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
-    footprints = Footprints(seen, width, height)
-    lists = footprints.tiles(footprints.whole)
-    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
+    footprints = Footprints(seen, width, height, compiled=False)
+    lists = footprints.tiles()
+    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.grid.columns
     xx, xy, yy = cov2d.unbind(-1)
     # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
     shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log2()]

@@ -203,23 +203,22 @@ def rasterization(
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
 
     images, throughs = [], []
-    absolute: dict[int, Tensor] = {}
-    for c, own in enumerate(means2d.split([len(s.ids) for s in seen])):
+    counts = [len(s.ids) for s in seen]
+    if absgrad:
+        absolute = torch.zeros_like(meta_means2d.detach())
+        setattr(meta_means2d, "absgrad", absolute)  # noqa: B010 - where gsplat puts it, on the tensor itself
+        rows = (torch.arange(len(dense_ids)).to(dense_ids) if packed else dense_ids).split(counts)
+    for c, own in enumerate(means2d.split(counts)):
         channels = [colored[c]] if colored else []
         if render_mode != "RGB":
             channels.append(seen[c].depths[:, None])
 
-        def keep_absgrad(values: Tensor, c: int = c) -> None:
-            absolute[c] = values
-            if len(absolute) == cameras:
-                of_all = _cat([absolute.pop(camera) for camera in range(cameras)])
-                of_all = of_all if packed else dense(of_all)
-                setattr(meta_means2d, "absgrad", of_all)  # noqa: B010 - where gsplat puts it, on the tensor itself
-
         one = replace(seen[c], means2d=own)
-        footprints = Footprints(one, width, height, QUALITIES[quality], compiled)
-        absgrad_of = keep_absgrad if absgrad else None
-        image, through = blend(one, _cat(channels, dim=-1), footprints, compiled, memory_budget, absgrad_of)
+        absolute_of = (absolute.view(-1, 2), rows[c]) if absgrad else None
+        values = _cat(channels, dim=-1)
+        kernels = compiled if values.shape[1] <= 4 else False  # they are made for colours and depth
+        footprints = Footprints(one, width, height, QUALITIES[quality], kernels)
+        image, through = blend(one, values, footprints, memory_budget, absolute_of)
         images.append(image)
         throughs.append(through)
     image, through = torch.stack(images), torch.stack(throughs)
@@ -252,7 +251,7 @@ def rasterization(
         "height": height,
         "n_cameras": cameras,
         "tile_size": TILE,
-        "tile_width": footprints.columns,
-        "tile_height": footprints.rows,
+        "tile_width": footprints.grid.columns,
+        "tile_height": footprints.grid.rows,
     }
     return image, accumulated, meta

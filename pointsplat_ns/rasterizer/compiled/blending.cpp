@@ -36,13 +36,13 @@ inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
 
 extern "C" {
 
-// Input and output of blending. Tiles are those of a region of one or several images of equal size, row by row.
+// Input and output of blending. Tiles are those of some rows of tiles of an image, row by row.
 struct Task {
     const float* table;        // [M, COLOR + channels], of pointsplat_tabulate
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
     const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
     const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
-    int64_t tiles, columns, top, left, width, height, channels;
+    int64_t tiles, columns, top, width, height, channels;
     float log2_alpha_min, alpha_min, alpha_max, clamped_from, transmittance_min;
     float* image;        // [tiles, channels, PIXELS]
     float* final_;       // [tiles, PIXELS] transmittance left
@@ -104,7 +104,7 @@ struct Place {
 };
 
 Place place_of(const Task& task, int64_t tile) {
-    const int64_t top = (task.top + tile / task.columns) * TILE, left = (task.left + tile % task.columns) * TILE;
+    const int64_t top = (task.top + tile / task.columns) * TILE, left = tile % task.columns * TILE;
     Place place{static_cast<float>(left + TILE / 2), static_cast<float>(top + TILE / 2), {}};
     for (int row = 0; row < TILE; ++row)
         for (int column = 0; column < TILE; ++column)

@@ -1,13 +1,12 @@
-// What one camera draws on which tile, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
+// What one camera draws, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
 //
-// pictures.py calls this file where it was built, then blends as for any picture. It does what
-// projection.cpp, colors.cpp and tiles.cpp do one after the other, without what lies between.
+// pictures.py calls this file where it was built, then lists the tiles and blends as for any picture. It does what
+// projection.cpp and colors.cpp do one after the other, without what lies between.
 
 #include <utility>
 #include <vector>
 
 #include "camera.h"
-#include "extent.h"
 #include "harmonics.h"
 
 extern "C" {
@@ -27,17 +26,13 @@ struct Placing {
     int64_t* heights;  // [ranges] sum of the rows of their boxes
     double* nearest;   // [ranges] least depth
     int64_t* order;    // [M] places of the Gaussians that are drawn, front to back
-    Strip* strips;     // [rows of all boxes] in this order
-    int64_t* offsets;  // [tiles + 1] where each tile's pairs start; before, in the next place, how many there are
-    int64_t* pairs;    // [P] the Gaussians of each tile, front to back
 };
 
 }  // extern "C"
 
 namespace {
 
-constexpr int GEOMETRY = 6;    // columns of the table before the colours
-constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
+constexpr int GEOMETRY = 6;  // columns of the table before the colours
 
 // Colours of up to eight Gaussians; NaN where a coefficient is not finite.
 template <int DEGREE>
@@ -109,46 +104,6 @@ void place_all(const Placing& task, int64_t* next) {
     });
 }
 
-// Writes the strips of a Gaussian by its place: the columns in each row of tiles of its box.
-void write_strips(const Placing& task, int64_t i, Strip* strips) {
-    const int32_t* box = task.boxes + 4 * i;
-    if (box[2] == box[3] || box[0] == box[1]) {  // the ellipse touches all tiles of its box
-        std::fill(strips, strips + (box[1] - box[0] + 1), Strip{box[2], box[3]});
-        return;
-    }
-    // In a row of tiles the ellipse a w^2 + d v^2 = 2 level reaches from r v - w to r v + w, at the v of the row that is
-    // nearest to where it is widest.
-    const float* s = task.table + (GEOMETRY + (task.degree < 0 ? 0 : 3)) * static_cast<int64_t>(task.ids[i]);
-    const float x = s[0], y = s[1], r = s[2], a = s[3], d = s[4];
-    const float level = 2.0f * std::max(s[5] - task.log2_alpha_min, 0.0f);
-    const float widest = r * std::sqrt(level / (d * (d / a + r * r)));
-    for (int32_t row = box[0]; row <= box[1]; ++row) {
-        const float top = row * TILE + (0.5f - task.slack) - y;
-        const float bottom = std::min(row * TILE + (TILE - 0.5f), task.camera.height - 0.5f) + task.slack - y;
-        const auto edge = [&](float v, float sign) {
-            v = std::min(std::max(v, top), bottom);
-            return x + r * v + sign * (std::sqrt(std::max(level - d * v * v, 0.0f) / a) + task.slack);
-        };
-        *strips++ = {static_cast<int32_t>(tile_from(edge(-widest, -1.0f), task.columns)),
-                     static_cast<int32_t>(tile_to(edge(widest, 1.0f), task.columns))};
-    }
-}
-
-// Calls ``visit`` with each Gaussian and each tile that its strips touch, front to back; ``before`` first, with its place
-// and its strips.
-template <typename Before, typename Visit>
-void each_pair(const Placing& task, int64_t drawn, Before before, Visit visit) {
-    Strip* strips = task.strips;
-    for (int64_t at = 0; at < drawn; ++at) {
-        const int64_t i = task.order[at], ahead = task.order[std::min(at + AHEAD, drawn - 1)];
-        __builtin_prefetch(task.boxes + 4 * ahead), __builtin_prefetch(task.ids + ahead);
-        before(at, i, strips);
-        for (int64_t row = task.boxes[4 * i]; row <= task.boxes[4 * i + 1]; ++row, ++strips)
-            for (int64_t column = strips->from; column <= strips->to; ++column)
-                visit(task.ids[i], row * task.columns + column);
-    }
-}
-
 // Sorts places by the depth in their upper half, equal ones as they stand, by three digits of 11 bits, and leaves the
 // places.
 void sort_by_depth(int64_t* values, int64_t count) {
@@ -184,9 +139,8 @@ void pointsplat_place(const Placing* task, int64_t* next) {
     }
 }
 
-// Orders the Gaussians by depth, equal ones by row, writes their strips, and counts the pairs of each tile into ``offsets``,
-// from its second place on.
-void pointsplat_count_placed(const Placing* task) {
+// Orders the Gaussians by depth, equal ones by row.
+void pointsplat_order(const Placing* task) {
     const int64_t ranges = (task->scene.count + RANGE - 1) / RANGE;
     if (ranges == 0) return;  // no Gaussians
     const double nearest = *std::min_element(task->nearest, task->nearest + ranges);
@@ -199,23 +153,7 @@ void pointsplat_count_placed(const Placing* task) {
             task->order[drawn++] = static_cast<int64_t>(bits) << 32 | i;
         }
     }
-    if (drawn == 0) return;
-    sort_by_depth(task->order, drawn);
-    const int64_t stride = GEOMETRY + (task->degree < 0 ? 0 : 3);
-    each_pair(
-        *task, drawn,
-        [&](int64_t at, int64_t i, Strip* strips) {
-            const int64_t ahead = task->order[std::min(at + AHEAD / 2, drawn - 1)];
-            __builtin_prefetch(task->table + stride * task->ids[ahead]);
-            write_strips(*task, i, strips);
-        },
-        [&](int64_t, int64_t tile) { ++task->offsets[tile + 1]; });
-}
-
-// Writes the Gaussians of each tile, front to back, from ``free``, [tiles], on.
-void pointsplat_list_placed(const Placing* task, int64_t drawn, int64_t* free) {
-    each_pair(
-        *task, drawn, [](int64_t, int64_t, Strip*) {}, [&](int64_t row, int64_t tile) { task->pairs[free[tile]++] = row; });
+    if (drawn) sort_by_depth(task->order, drawn);
 }
 
 }  // extern "C"
