@@ -72,7 +72,7 @@ class Blend(torch.autograd.Function):
         summed = engine.differentiate_region(
             grid, tiles, inputs, tape, final, grad_image, grad_final, absgrad is not None
         )
-        first, last = MOMENTS, MOMENTS + inputs.channels
+        first, last = MOMENTS, MOMENTS + colors.shape[1]
         if absgrad is not None:
             absgrad[0].index_add_(0, absgrad[1], summed[:, last:])
         grads = engine.chain(summed[:, :first], cov2d, det, opacities)

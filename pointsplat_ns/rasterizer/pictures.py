@@ -6,20 +6,15 @@ over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.raste
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer.blending import untiled
 from pointsplat_ns.rasterizer.compiled import blending, tiles
-from pointsplat_ns.rasterizer.compiled.blending import KernelInputs
-from pointsplat_ns.rasterizer.compiled.projection import camera_struct, scene_struct
-from pointsplat_ns.rasterizer.constants import SLACK
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid
+from pointsplat_ns.rasterizer.ellipses import Grid
 from pointsplat_ns.rasterizer.ewa import Lens
-from pointsplat_ns.rasterizer.projection import count_meaningless
+from pointsplat_ns.rasterizer.projection import camera_struct, count_meaningless, scene_struct
 from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
@@ -53,29 +48,23 @@ def _placed(
     channels, grid = (3 if colored else 0), Grid(camera[2].width, camera[2].height, alpha_min)
     ranges = -(-count // library.pointsplat_range())
     table, depths = torch.empty(count, 6 + channels, **FLOATS), torch.empty(count, **DOUBLES)
-    ids, boxes = (
-        torch.empty(count, dtype=torch.int32, device="cpu"),
-        torch.empty(count, 4, dtype=torch.int32, device="cpu"),
-    )
-    counts, heights = torch.empty(ranges, **INDICES), torch.empty(ranges, **INDICES)
+    counts = torch.empty(ranges, **INDICES)
     task = KERNELS.structs["Placing"](
         camera=camera_struct(*camera), scene=scene_struct(*tensors),
         first=coefficients[0], rest=coefficients[1], rest_row=3 * coefficients[1].shape[1],
         degree=scene.sh_degree if colored else -1,
-        rows=grid.rows, columns=grid.columns, log2_alpha_min=math.log2(alpha_min), slack=SLACK,
-        most_color=torch.finfo(torch.float32).max ** 0.8, table=table, ids=ids, depths=depths, boxes=boxes,
-        counts=counts, heights=heights, nearest=torch.empty(ranges, **DOUBLES),
+        most_color=torch.finfo(torch.float32).max ** 0.8, table=table, depths=depths, counts=counts,
+        ids=torch.empty(count, dtype=torch.int32, device="cpu"), nearest=torch.empty(ranges, **DOUBLES),
     )  # fmt: skip
     on_threads(count >= SEVERAL, library.pointsplat_place, task)
     order = torch.empty(int(counts.sum()), **INDICES)
     task.fill(order=order)
     library.pointsplat_order(task)
-    ellipses, strips = Ellipses(order, table, boxes), int(heights.sum())
-    found = tiles.listed(ellipses, grid, 0, grid.rows, strips, ids=ids, most_pairs=most_pairs)
+    found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, most_pairs=most_pairs)
     if found is None:
         return None
     pairs, offsets, _ = found
-    return blending.task_of(KernelInputs(table, channels, alpha_min), grid, pairs, offsets, offsets), pairs, tensors
+    return blending.task_of(table, grid, pairs, offsets, offsets), pairs, tensors
 
 
 def picture(scene: Gaussians, camera: Camera, alpha_min: float, most_pairs: int) -> tuple[Tensor, Tensor, int] | None:

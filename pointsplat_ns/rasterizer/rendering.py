@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import fields, replace
 from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
-from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET, QUALITIES, TILE
 from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, on_cpu, project
@@ -22,6 +23,32 @@ RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
 Colors = Tensor | tuple[Tensor, Tensor]
 """Channels or SH coefficients; or the first SH coefficient of each Gaussian, (N, 3), and the others, (N, K - 1, 3)."""
+
+
+@functools.cache
+def gsplat_works() -> bool:
+    """Whether gsplat's CUDA kernels are there. The first call may compile them, as Splatfacto's first step does."""
+    if not torch.cuda.is_available():
+        return False
+    try:
+        from gsplat.cuda._backend import _C
+    except Exception:  # a failed compilation raises errors of many types
+        return False
+    return _C is not None
+
+
+def use_gsplat(backend: str, device: torch.device) -> bool:
+    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on ``device``. Raises
+    PointSplatError if gsplat is asked for and cannot be used."""
+    if backend not in ("gsplat", "auto"):
+        raise ValueError(f"backend is {backend!r}; expected torch, gsplat or auto")
+    usable = device.type == "cuda" and gsplat_works()
+    if backend == "gsplat" and not usable:
+        raise PointSplatError(
+            f"backend gsplat: the Gaussians are on {device.type} and gsplat's CUDA kernels are "
+            f"{'there' if gsplat_works() else 'not there'}; expected both on CUDA; use auto or torch"
+        )
+    return usable
 
 
 def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:

@@ -16,14 +16,6 @@ from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import FLOATS, INDICES
 
 
-class KernelInputs(NamedTuple):
-    """Projected Gaussians in the kernels' layout."""
-
-    table: Tensor  # [M, 6 + D]
-    channels: int
-    alpha_min: float
-
-
 class KernelTape(NamedTuple):
     """Results of the forward pass that the backward pass needs."""
 
@@ -32,20 +24,15 @@ class KernelTape(NamedTuple):
     chunks: Tensor  # [tiles + 1] int64, where each tile's chunks start
 
 
-def table_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """Rows of the projected Gaussians (M, 6 + D): six columns of geometry, then the colours (M, D)."""
+def inputs_of(
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, _alpha_min: float
+) -> Tensor:
+    """Table of projected Gaussians as the kernels read them, (M, 6 + D): geometry, then the colours (M, D)."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
     table = colors.new_empty(count, 6 + channels)
     on_threads(count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
     return table
-
-
-def inputs_of(
-    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, alpha_min: float
-) -> KernelInputs:
-    """As :func:`~pointsplat_ns.rasterizer.eager.inputs_of`, without what only torch needs."""
-    return KernelInputs(table_of(means2d, cov2d, det, opacities, colors), colors.shape[1], alpha_min)
 
 
 def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
@@ -60,29 +47,27 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     return grads
 
 
-def task_of(
-    inputs: KernelInputs, grid: Grid, gaussians: Tensor, offsets: Tensor, chunks: Tensor, top: int = 0
-) -> Struct:
+def task_of(table: Tensor, grid: Grid, gaussians: Tensor, offsets: Tensor, chunks: Tensor, top: int = 0) -> Struct:
     """The task of drawing some rows of tiles, without its output.
 
     Args:
-        inputs: the Gaussians.
+        table: of :func:`inputs_of`.
         grid: of the image.
-        gaussians: (P,) int64, rows of the inputs' table, by tile and front to back.
+        gaussians: (P,) int64, rows of the table, by tile and front to back.
         offsets: (tiles + 1,) int64, where those of each tile start.
         chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
         top: the first row of tiles.
     """
     return KERNELS.structs["Task"](
-        table=inputs.table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
-        columns=grid.columns, top=top, width=grid.width, height=grid.height, channels=inputs.channels,
-        log2_alpha_min=math.log2(inputs.alpha_min), alpha_min=inputs.alpha_min,
+        table=table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
+        columns=grid.columns, top=top, width=grid.width, height=grid.height, channels=table.shape[1] - 6,
+        log2_alpha_min=math.log2(grid.alpha_min), alpha_min=grid.alpha_min,
         alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=TRANSMITTANCE_MIN,
     )  # fmt: skip
 
 
 def blend_region(
-    grid: Grid, tiles: TileList, inputs: KernelInputs, image: Tensor, final: Tensor, keep_tape: bool
+    grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
 ) -> KernelTape | None:
     """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
     library = KERNELS.library
@@ -91,7 +76,7 @@ def blend_region(
     torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
     before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
     blended = torch.empty_like(tiles.offsets[1:])
-    task = task_of(inputs, grid, tiles.gaussians, tiles.offsets, chunks, tiles.top)
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, chunks, tiles.top)
     task.fill(image=image, final_=final, blended=blended, before=before if keep_tape and len(before) else None)
     on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
@@ -110,7 +95,7 @@ def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
 def differentiate_region(
     grid: Grid,
     tiles: TileList,
-    inputs: KernelInputs,
+    table: Tensor,
     tape: KernelTape,
     final: Tensor,  # [tiles, 64]
     grad_image: Tensor,  # [tiles, D, 64]
@@ -120,9 +105,9 @@ def differentiate_region(
     """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
     library = KERNELS.library
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
-    columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
+    columns = MOMENTS + table.shape[1] - 6 + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
-    task = task_of(inputs, grid, tiles.gaussians, tiles.offsets, tape.chunks, tiles.top)
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, tape.chunks, tiles.top)
     task.fill(
         final_=final, before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
         grad_final=grad_final.contiguous(), sums=sums, absolute=int(absgrad),

@@ -16,16 +16,13 @@ struct Placing {
     Scene scene;
     const float *first, *rest;       // SH coefficients, [N, 3] and [N, K - 1, 3]
     int64_t rest_row, degree;        // numbers of the others of a Gaussian; degree of the basis, -1 for no colours
-    int64_t rows, columns;           // of tiles
-    float log2_alpha_min, slack, most_color;
+    float most_color;
     float* table;      // [N, 6 + channels], as of pointsplat_tabulate; rows of Gaussians that are not drawn stay as they are
     int32_t* ids;      // [N] Gaussians that are drawn, those of each range from where the range begins
     double* depths;    // [N] of these
-    int32_t* boxes;    // [N, 4] first and last row of tiles, first and last column
     int64_t* counts;   // [ranges] how many are drawn
-    int64_t* heights;  // [ranges] sum of the rows of their boxes
     double* nearest;   // [ranges] least depth
-    int64_t* order;    // [M] places of the Gaussians that are drawn, front to back
+    int64_t* order;    // [M] the Gaussians that are drawn, front to back
 };
 
 }  // extern "C"
@@ -57,8 +54,6 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
     const Position at(camera, lanes, task.scene.means);
     const Flat flat(camera, at, Shape(camera, at, lanes, task.scene), lanes.load(task.scene.opacities));
     const Lane base = each(flat.alpha, [](float value) { return std::log2(value); });
-    const Lane level = (2.0f * LN2) * larger(base - task.log2_alpha_min, ZERO);  // squared Mahalanobis distance
-    const Lane half_x = root(level * flat.xx) + task.slack, half_y = root(level * flat.yy) + task.slack;
     const Lane rows[GEOMETRY] = {flat.x, flat.y, flat.xy / flat.yy, LOG2E * flat.yy / flat.det, LOG2E / flat.yy, base};
     float colors[LANES][3];
     if constexpr (DEGREE >= 0) color_lanes<DEGREE>(task, lanes, at, colors);
@@ -67,13 +62,6 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
         bool usable = true;  // no colour is NaN
         for (int c = 0; c < CHANNELS; ++c) usable &= colors[lane][c] < task.most_color;
         if (!usable) continue;
-        const float x = flat.x[lane], y = flat.y[lane];
-        int32_t* box = task.boxes + 4 * to;
-        box[0] = static_cast<int32_t>(tile_from(y - half_y[lane], task.rows));
-        box[1] = static_cast<int32_t>(tile_to(y + half_y[lane], task.rows));
-        box[2] = static_cast<int32_t>(tile_from(x - half_x[lane], task.columns));
-        box[3] = static_cast<int32_t>(tile_to(x + half_x[lane], task.columns));
-        if (box[0] > box[1] || box[2] > box[3]) continue;
         float* row = task.table + COLUMNS * lanes.rows[lane];
         for (int i = 0; i < GEOMETRY; ++i) row[i] = rows[i][lane];
         for (int c = 0; c < CHANNELS; ++c) row[GEOMETRY + c] = colors[lane][c];
@@ -96,11 +84,8 @@ void place_all(const Placing& task, int64_t* next) {
             to = place_lanes<DEGREE>(task, lanes, to);
         }
         task.counts[range] = to - first;
-        task.nearest[range] = std::numeric_limits<double>::infinity(), task.heights[range] = 0;
-        for (int64_t i = first; i < to; ++i) {
-            task.nearest[range] = std::min(task.nearest[range], task.depths[i]);
-            task.heights[range] += task.boxes[4 * i + 1] - task.boxes[4 * i] + 1;
-        }
+        task.nearest[range] = std::numeric_limits<double>::infinity();
+        for (int64_t i = first; i < to; ++i) task.nearest[range] = std::min(task.nearest[range], task.depths[i]);
     });
 }
 
@@ -153,7 +138,9 @@ void pointsplat_order(const Placing* task) {
             task->order[drawn++] = static_cast<int64_t>(bits) << 32 | i;
         }
     }
-    if (drawn) sort_by_depth(task->order, drawn);
+    if (drawn == 0) return;
+    sort_by_depth(task->order, drawn);
+    for (int64_t i = 0; i < drawn; ++i) task->order[i] = task->ids[task->order[i]];
 }
 
 }  // extern "C"

@@ -18,11 +18,11 @@ struct Strip {
 // Gaussians, front to back, and the tiles that they touch in some rows of tiles.
 struct Listing {
     const float* table;
-    const int32_t* boxes;  // [.., 4] first and last row of tiles, first and last column, by place
-    const int32_t* ids;    // row of the table, by place; null if it is the place
-    const int64_t* order;  // [M] places, front to back
-    int64_t count, stride;  // M, numbers in a row of the table
-    int64_t height, columns, top, bottom;  // of the image, pixels and tiles; rows of tiles from top on, before bottom
+    int64_t stride;         // numbers in a row of the table
+    const int64_t* order;   // [M] rows, front to back
+    int64_t count;          // M
+    int32_t* boxes;         // [M, 4] in this order, first and last row of tiles, first and last column
+    int64_t height, rows, columns, top, bottom;  // of the image, pixels and tiles; rows of tiles from top on, before bottom
     float log2_alpha_min, slack;
     Strip* strips;                // one for each row of tiles of each Gaussian
     int64_t* offsets;             // [tiles + 1] counts, in the next place, then where each tile's pairs start
@@ -46,16 +46,23 @@ struct Ellipse {
     }
 };
 
-inline int64_t id_of(const Listing& l, int64_t place) { return l.ids ? l.ids[place] : place; }
+// Fetches the row of a Gaussian that is read soon.
+inline void fetch(const Listing& l, int64_t at) {
+    __builtin_prefetch(l.table + l.stride * l.order[std::min(at + AHEAD, l.count - 1)]);
+}
+
+inline Ellipse ellipse_of(const Listing& l, int64_t at) {
+    return Ellipse(l.table + l.stride * l.order[at], l.log2_alpha_min);
+}
 
 // Writes the strips of a Gaussian in rows of tiles ``top`` to ``bottom``.
-void write_strips(const Listing& l, int64_t place, int64_t top, int64_t bottom, Strip* strips) {
-    const int32_t* box = l.boxes + 4 * place;
+void write_strips(const Listing& l, int64_t at, int64_t top, int64_t bottom, Strip* strips) {
+    const int32_t* box = l.boxes + 4 * at;
     if (box[2] == box[3] || box[0] == box[1]) {  // the ellipse touches all tiles of its box
         std::fill(strips, strips + std::max<int64_t>(bottom - top + 1, 0), Strip{box[2], box[3]});
         return;
     }
-    const Ellipse e(l.table + l.stride * id_of(l, place), l.log2_alpha_min);
+    const Ellipse e = ellipse_of(l, at);
     const float widest = e.across > 0.0f ? e.r * e.down / e.across * e.down : 0.0f;
     for (int64_t row = top; row <= bottom; ++row) {
         const float first = row * TILE + (0.5f - l.slack) - e.y;
@@ -69,21 +76,18 @@ void write_strips(const Listing& l, int64_t place, int64_t top, int64_t bottom, 
     }
 }
 
-// Calls ``visit`` with the number in the order and the row of each Gaussian, and each tile that its strips touch; ``before``
-// first, with its place, its rows of tiles and its strips.
+// Calls ``visit`` with the place of each Gaussian in the order and each tile that its strips touch; ``before`` first, with
+// the place, its rows of tiles and its strips.
 template <typename Before, typename Visit>
 void each_pair(const Listing& l, Before before, Visit visit) {
     Strip* strips = l.strips;
     for (int64_t at = 0; at < l.count; ++at) {
-        const int64_t place = l.order[at], ahead = l.order[std::min(at + AHEAD, l.count - 1)];
-        __builtin_prefetch(l.boxes + 4 * ahead);
-        if (l.ids) __builtin_prefetch(l.ids + ahead);
-        const int32_t* box = l.boxes + 4 * place;
+        const int32_t* box = l.boxes + 4 * at;
         const int64_t top = std::max<int64_t>(box[0], l.top), bottom = std::min<int64_t>(box[1], l.bottom - 1);
-        before(at, place, top, bottom, strips);
+        before(at, top, bottom, strips);
         for (int64_t row = top; row <= bottom; ++row, ++strips)
             for (int64_t column = strips->from; column <= strips->to; ++column)
-                visit(at, id_of(l, place), (row - l.top) * l.columns + column);
+                visit(at, (row - l.top) * l.columns + column);
     }
 }
 
@@ -91,17 +95,19 @@ void each_pair(const Listing& l, Before before, Visit visit) {
 
 extern "C" {
 
-// Writes the boxes of ``count`` Gaussians in the rows of a table without colours.
-void pointsplat_boxes(const float* table, int64_t count, float log2_alpha_min, float slack, int64_t rows, int64_t columns,
-                      int32_t* boxes, int64_t* next) {
-    each_range(next, count, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i) {
-            const Ellipse e(table + 6 * i, log2_alpha_min);
-            const float half_y = e.down + slack, half_x = e.across + slack;
-            boxes[4 * i] = static_cast<int32_t>(tile_from(e.y - half_y, rows));
-            boxes[4 * i + 1] = static_cast<int32_t>(tile_to(e.y + half_y, rows));
-            boxes[4 * i + 2] = static_cast<int32_t>(tile_from(e.x - half_x, columns));
-            boxes[4 * i + 3] = static_cast<int32_t>(tile_to(e.x + half_x, columns));
+// Writes boxes.
+void pointsplat_boxes(const Listing* listing, int64_t* next) {
+    const Listing& l = *listing;
+    each_range(next, l.count, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t at = first; at < last; ++at) {
+            fetch(l, at);
+            const Ellipse e = ellipse_of(l, at);
+            const float half_y = e.down + l.slack, half_x = e.across + l.slack;
+            int32_t* box = l.boxes + 4 * at;
+            box[0] = static_cast<int32_t>(tile_from(e.y - half_y, l.rows));
+            box[1] = static_cast<int32_t>(tile_to(e.y + half_y, l.rows));
+            box[2] = static_cast<int32_t>(tile_from(e.x - half_x, l.columns));
+            box[3] = static_cast<int32_t>(tile_to(e.x + half_x, l.columns));
         }
     });
 }
@@ -111,12 +117,11 @@ void pointsplat_count(const Listing* listing) {
     const Listing& l = *listing;
     each_pair(
         l,
-        [&](int64_t at, int64_t place, int64_t top, int64_t bottom, Strip* strips) {
-            const int64_t ahead = l.order[std::min(at + AHEAD / 2, l.count - 1)];
-            __builtin_prefetch(l.table + l.stride * id_of(l, ahead));
-            write_strips(l, place, top, bottom, strips);
+        [&](int64_t at, int64_t top, int64_t bottom, Strip* strips) {
+            fetch(l, at);
+            write_strips(l, at, top, bottom, strips);
         },
-        [&](int64_t at, int64_t, int64_t tile) {
+        [&](int64_t at, int64_t tile) {
             ++l.offsets[tile + 1];
             if (l.counts) ++l.counts[at];
         });
@@ -128,10 +133,10 @@ void pointsplat_list(const Listing* listing) {
     std::vector<int64_t> free(l.offsets, l.offsets + (l.bottom - l.top) * l.columns);  // where the next pair of each tile goes
     int64_t pair = 0;
     each_pair(
-        l, [](int64_t, int64_t, int64_t, int64_t, Strip*) {},
-        [&](int64_t, int64_t row, int64_t tile) {
+        l, [](int64_t, int64_t, int64_t, Strip*) {},
+        [&](int64_t at, int64_t tile) {
             const int64_t to = free[tile]++;
-            l.gaussians[to] = row;
+            l.gaussians[to] = l.order[at];
             if (l.places) l.places[to] = pair++;
         });
 }

@@ -9,33 +9,35 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from pointsplat_ns.rasterizer.compiled.blending import table_of
+from pointsplat_ns.rasterizer.compiled.blending import inputs_of
 from pointsplat_ns.rasterizer.constants import SLACK
 from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, TileList
-from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import INDICES
 
 
 def ellipses_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, order: Tensor, grid: Grid) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
-    table = table_of(means2d, cov2d, det, opacities, means2d[:, :0])
-    boxes = torch.empty(len(order), 4, dtype=torch.int32, device="cpu")
-    on_threads(
-        len(order) >= SEVERAL, KERNELS.library.pointsplat_boxes, table, len(order), math.log2(grid.alpha_min), SLACK,
-        grid.rows, grid.columns, boxes,
+    return boxed(inputs_of(means2d, cov2d, det, opacities, means2d[:, :0], grid.alpha_min), order, grid)
+
+
+def boxed(table: Tensor, order: Tensor, grid: Grid) -> Ellipses:
+    """The ellipses of the Gaussians in some rows of a table, ``order``, (M,) int64, front to back."""
+    found = Ellipses(order, table, torch.empty(len(order), 4, dtype=torch.int32, device="cpu"))
+    on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_boxes, _task(found, grid, 0, grid.rows))
+    return found
+
+
+def _task(ellipses: Ellipses, grid: Grid, top: int, bottom: int, **lists: Tensor | None) -> Struct:
+    return KERNELS.structs["Listing"](
+        table=ellipses.shapes, stride=ellipses.shapes.shape[1], boxes=ellipses.boxes, order=ellipses.order,
+        count=len(ellipses.order), height=grid.height, rows=grid.rows, columns=grid.columns, top=top, bottom=bottom,
+        log2_alpha_min=math.log2(grid.alpha_min), slack=SLACK, **lists,
     )  # fmt: skip
-    return Ellipses(order, table, boxes)
 
 
 def listed(
-    ellipses: Ellipses,
-    grid: Grid,
-    top: int,
-    bottom: int,
-    strips: int,
-    ids: Tensor | None = None,
-    counts: Tensor | None = None,
-    most_pairs: float = math.inf,
+    ellipses: Ellipses, grid: Grid, top: int, bottom: int, counts: Tensor | None = None, most_pairs: float = math.inf
 ) -> tuple[Tensor, Tensor, Tensor | None] | None:
     """The Gaussians that touch the tiles of the rows from ``top`` on before ``bottom``.
 
@@ -43,8 +45,6 @@ def listed(
         ellipses: M Gaussians.
         grid: of the image.
         top, bottom: rows of tiles.
-        strips: number of these rows that each Gaussian reaches, summed.
-        ids: int32, row of the table of each box, if it is not the box's own.
         counts: (M,) int64 zeros, to which the pairs of each Gaussian are added, in depth order.
         most_pairs: largest number P of pairs of Gaussian and tile.
 
@@ -52,13 +52,10 @@ def listed(
         Rows of the table by tile, front to back (P,), where those of each tile start (tiles + 1,), and, given
         ``counts``, the places of :class:`TileList`, all int64; None if the pairs are too many.
     """
+    first, last = ellipses.boxes[:, 0].clamp_min(top), ellipses.boxes[:, 1].clamp_max(bottom - 1)
+    strips = torch.empty(int((last - first + 1).clamp_min_(0).sum()), 2, dtype=torch.int32, device="cpu")
     offsets = torch.zeros((bottom - top) * grid.columns + 1, **INDICES)
-    task = KERNELS.structs["Listing"](
-        table=ellipses.shapes, boxes=ellipses.boxes, ids=ids, order=ellipses.order, count=len(ellipses.order),
-        stride=ellipses.shapes.shape[1], height=grid.height, columns=grid.columns, top=top, bottom=bottom,
-        log2_alpha_min=math.log2(grid.alpha_min), slack=SLACK, offsets=offsets, counts=counts,
-        strips=torch.empty(strips, 2, dtype=torch.int32, device="cpu"),
-    )  # fmt: skip
+    task = _task(ellipses, grid, top, bottom, strips=strips, offsets=offsets, counts=counts)
     KERNELS.library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
@@ -72,9 +69,6 @@ def listed(
 
 def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
-    first, last = ellipses.boxes[:, 0].clamp_min(top), ellipses.boxes[:, 1].clamp_max(bottom - 1)
     counts = torch.zeros_like(ellipses.order)
-    strips = int((last - first + 1).clamp_min_(0).sum())
-    found = listed(ellipses, grid, top, bottom, strips, counts=counts)
-    gaussians, offsets, places = cast(tuple[Tensor, Tensor, Tensor], found)
+    gaussians, offsets, places = cast(tuple[Tensor, Tensor, Tensor], listed(ellipses, grid, top, bottom, counts))
     return TileList(gaussians, offsets, places, counts, ellipses.order, top)
