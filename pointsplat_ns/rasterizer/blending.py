@@ -1,9 +1,8 @@
 """Front-to-back alpha blending over tiles, with its own backward pass.
 
 Done in torch (:mod:`~pointsplat_ns.rasterizer.blocks`), or by compiled kernels where they were built
-(:mod:`~pointsplat_ns.rasterizer.compiled.blending`). What is evaluated per pixel, and how gradients are summed, stands
-in :mod:`~pointsplat_ns.rasterizer.quadratics`; which Gaussian is drawn on which pixel in
-:mod:`~pointsplat_ns.rasterizer.alpha`.
+(:mod:`~pointsplat_ns.rasterizer.compiled.blending`), by the algebra of :mod:`~pointsplat_ns.rasterizer.quadratics` and
+the rule of :mod:`~pointsplat_ns.rasterizer.alpha`.
 
 Shapes: M Gaussians, 64 = TILE * TILE pixels, D channels.
 """
@@ -21,13 +20,6 @@ from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.tensors import full_precision
-
-
-def bytes_per_pair(colors: Tensor) -> int:
-    """Bytes that a pair of tile and Gaussian takes with colours (M, D): each channel has a gradient sum."""
-    size = colors.element_size()
-    # 192 bytes a pair of RGB in float32: lists, tape, gradient sums.
-    return 192 * size // 4 + (colors.shape[1] - 3) * size
 
 
 def untiled(values: Tensor, columns: int) -> Tensor:
@@ -100,7 +92,9 @@ def blend(
     Returns:
         Colours (H, W, D) over black, and the remaining transmittance (H, W, 1).
     """
-    bands = footprints.regions(max(1, memory_budget // bytes_per_pair(colors)))
+    size = colors.element_size()
+    # 192 bytes a pair of RGB in float32: lists, tape, gradient sums, of which each channel has one
+    bands = footprints.regions(max(1, memory_budget // (48 * size + (colors.shape[1] - 3) * size)))
     shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
     drawn = [Blend.apply(*shapes, colors, footprints, rows, len(bands) == 1, absgrad) for rows in bands]
     grid = footprints.grid

@@ -213,11 +213,8 @@ class Frame:
         return place.masked_fill_(place >= tiles.end[:, None], self.pairs_count).view(-1)
 
 
-class Tape(NamedTuple):
-    """Results of the forward pass that the backward pass needs."""
-
-    frame: Frame
-    chunks: list[list[Chunk]]  # by block
+Tape = tuple[Frame, list[list[Chunk]]]
+"""Results of the forward pass that the backward pass needs: the chunks by block."""
 
 
 def _blend_block(
@@ -271,49 +268,7 @@ def blend_region(
     work = WorkArrays(frame.capacity, frame.block, image)
     begins = range(0, frame.occupied, frame.block)
     chunks = [_blend_block(frame, inputs, work, image, final, keep_tape, begin) for begin in begins]
-    return Tape(frame, chunks) if keep_tape else None
-
-
-def _blend_block_backward(
-    frame: Frame,
-    inputs: Inputs,
-    work: WorkArrays,
-    final: Tensor,  # [tiles, 64]
-    grad_image: Tensor,  # [tiles, D, 64]
-    grad_final: Tensor,  # [tiles, 64]
-    chunks: list[Chunk],
-    place: Tensor,  # [pairs of the chunks] int64, written: places in the pair list
-    sums: Tensor,  # [pairs of the chunks, MOMENTS + D (+ 2)], written
-) -> None:
-    """The gradient sums of the pairs of one block, the last chunk first."""
-    channels = inputs.channels
-    whole = chunks[0].tiles.ids
-    block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
-    # sum over later Gaussians of weight * (color . grad), and the background
-    behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
-    done = 0
-    for tiles, rows, first, s, before in reversed(chunks):
-        b = before.shape[0]
-        pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
-        here = slice(done, done + b * s)
-        done += b * s
-        place[here] = frame.pairs(tiles, first, s)
-        pairs = gather(inputs.table, frame.gaussians.index_select(0, place[here]), tiles.x, tiles.y)
-        behind_here = behind if rows is None else behind.index_select(0, rows)
-        grad_log, grad_colors, behind_here = blend_chunk_backward(inputs, pairs, before, behind_here, pixels, work)
-        if rows is None:
-            behind = behind_here
-        else:
-            behind.index_copy_(0, rows, behind_here)
-
-        packed = sums[here]
-        packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
-        flat = grad_log.view(-1, PIXELS)
-        if sums.shape[1] > MOMENTS + channels:  # absolute gradients of the means
-            for column, slope in enumerate(mean_slopes(pairs.coefficients)):
-                slope = torch.mm(slope, inputs.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
-                packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
-        moments(pairs, torch.mm(inputs.basis, flat.T), packed)
+    return (frame, chunks) if keep_tape else None
 
 
 def differentiate_region(
@@ -327,15 +282,40 @@ def differentiate_region(
     absgrad: bool,
 ) -> Tensor:
     """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
-    frame = tape.frame
-    sizes = [sum(chunk.before.shape[0] * chunk.size for chunk in chunks) for chunks in tape.chunks]
-    total = sum(sizes)
+    frame, blocks = tape
+    total = sum(chunk.before.shape[0] * chunk.size for chunks in blocks for chunk in chunks)
     sums = grad_image.new_empty(total + 1, MOMENTS + inputs.channels + (2 if absgrad else 0))  # in the tape's order
     sums[-1] = 0.0
     place = frame.gaussians.new_empty(total)  # in the pair list
     work = WorkArrays(frame.capacity, frame.block, grad_image)
-    for block in zip(tape.chunks, place.split(sizes), sums[:-1].split(sizes), strict=True):
-        _blend_block_backward(frame, inputs, work, final, grad_image, grad_final, *block)
+    channels, done = inputs.channels, 0
+    for chunks in blocks:
+        whole = chunks[0].tiles.ids
+        block_pixels = grad_image.index_select(0, whole)  # [B, D, 64]
+        # sum over later Gaussians of weight * (color . grad), and the background
+        behind = grad_final.index_select(0, whole) * final.index_select(0, whole)
+        for left, rows, first, s, before in reversed(chunks):
+            b = before.shape[0]
+            here = slice(done, done + b * s)
+            done += b * s
+            place[here] = frame.pairs(left, first, s)
+            pairs = gather(inputs.table, frame.gaussians.index_select(0, place[here]), left.x, left.y)
+            pixels = block_pixels if rows is None else block_pixels.index_select(0, rows)
+            behind_here = behind if rows is None else behind.index_select(0, rows)
+            grad_log, grad_colors, behind_here = blend_chunk_backward(inputs, pairs, before, behind_here, pixels, work)
+            if rows is None:
+                behind = behind_here
+            else:
+                behind.index_copy_(0, rows, behind_here)
+
+            packed = sums[here]
+            packed[:, MOMENTS : MOMENTS + channels].view(b, s, channels).copy_(grad_colors.transpose(1, 2))
+            flat = grad_log.view(-1, PIXELS)
+            if absgrad:
+                for column, slope in enumerate(mean_slopes(pairs.coefficients)):
+                    slope = torch.mm(slope, inputs.basis[:3], out=work.array(0, b, s).view(-1, PIXELS))
+                    packed[:, MOMENTS + channels + column] = slope.mul_(flat).abs_().sum(-1)
+            moments(pairs, torch.mm(inputs.basis, flat.T), packed)
 
     # group the sums of pairs by Gaussian; pairs behind a saturated tile have no sum
     by_place = place.new_full((frame.pairs_count + 1,), total)

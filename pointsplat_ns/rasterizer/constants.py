@@ -24,13 +24,8 @@ SLACK = 1e-3
 
 
 QUALITIES = {"exact": ALPHA_MIN, "balanced": 2 / 255, "fast": 8 / 255}
-"""The lowest alpha that is drawn, by the name of a quality; what they gain and lose is measured by
-lab/speed/rasterizer.py. Only this threshold pays.
-
-A higher stop threshold skips the opaque Gaussian that would have finished a pixel, and is wrong by up to 0.5 where it
-does. A lower degree of the harmonics loses far more for less time. exp2 in bfloat16 takes twice the time of float32,
-and tiles of 16 pixels were slower than of 8.
-"""
+"""The lowest alpha that is drawn, by the name of a quality, measured by lab/speed/rasterizer.py. A higher stop
+threshold would skip the opaque Gaussian that finishes a pixel, and be wrong by up to 0.5 there."""
 
 MEMORY_BUDGET = 2**31
 """Bytes that the lists of pairs of one image may take before it is drawn in several regions."""

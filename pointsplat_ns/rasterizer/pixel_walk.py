@@ -1,9 +1,7 @@
 """Sums over the pixels of a view, for each Gaussian, that no gradient of the picture gives.
 
-The rasterizer's own gradients give sums over pixels that are linear in the picture. How many pixels a
-Gaussian is drawn on, or the sum of squares of the gradients of each pixel, are not. This module walks the
-projected Gaussians of a view front to back, tile by tile, by the rasterizer's rules, and hands every pair of
-Gaussian and pixel to a function.
+Such as how many pixels a Gaussian is drawn on, or the sum of squares of the gradients of each pixel. The projected
+Gaussians of a view are walked front to back, tile by tile, by the rasterizer's rules.
 
 Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64 pixels a tile.
 """

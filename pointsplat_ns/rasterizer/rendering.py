@@ -13,7 +13,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET, QUALITIES, TILE
-from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, on_cpu, project
+from pointsplat_ns.rasterizer.projection import Projected, camera_of, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.tensors import full_precision
@@ -109,29 +109,27 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict]:
     """Render 3D Gaussians from C pinhole cameras, on any torch device.
 
-    Called as ``gsplat.rasterization`` (1.4.0). ``distributed``, ``camera_model``, ``covars`` and SH of degree 4 are not
-    taken, and ``meta`` has no lists of tiles; docs/rasterizer.md lists all differences. Differentiable in means, quats,
-    scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
-    they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
-    place the camera exactly, however far from the origin. Cameras are best given on the CPU, where they are computed
-    with in float64: those on a GPU are fetched from it, which waits for all that it has to do.
+    Called as ``gsplat.rasterization`` (1.4.0); docs/rasterizer.md lists the differences. Differentiable in means,
+    quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as they are, lower
+    precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians place the camera exactly,
+    however far from the origin. Cameras are best given on the CPU: those on a GPU are fetched from it, which waits for
+    all that it has to do.
 
     Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian, an opacity
     of 1 opaque. Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
     6e30, whose gradients float32 could not hold) are not drawn, get a zero gradient and are counted in
     ``meta["skipped"]``.
 
-    The same input gives the same bits, forward and backward, on the same machine and number of threads. One thread and
-    two give the same image, and by compiled kernels the same gradients. Otherwise another number rounds in another way,
-    which moves images and gradients by 1e-6 of their size; so may another machine, device or version of torch.
+    The same input gives the same bits, forward and backward, on the same machine and number of threads; by compiled
+    kernels on any number. Otherwise images and gradients move by 1e-6 of their size.
 
     Args:
         means: centres, world space.
-        quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
+        quats: wxyz, any length; one of less than 1e-38 is the identity.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
         colors: D channels, or SH coefficients if ``sh_degree`` is given: one tensor, or two with the first coefficient
-            and the others, as :class:`~pointsplat_ns.Gaussians` holds them, which saves taking them apart.
+            and the others.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
@@ -143,16 +141,16 @@ def rasterization(
         backgrounds: (C, D), one colour a camera; depth channels are not composited over it.
         render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED`` (that
             divided by the accumulated alpha), or both.
-        absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
-            the absolute gradient (AbsGS, arXiv 2404.10484).
+        absgrad: the backward pass adds the sum over pixels of the absolute gradient (AbsGS, arXiv 2404.10484) to
+            ``meta["means2d"].absgrad``.
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
         backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so where it can. The arguments
             below have no effect on gsplat.
         quality: by which lowest alpha to trade accuracy for speed; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
             most four channels): None where they were built; True warns where they were not; False never.
-        memory_budget: bytes that lists of pairs may take before the image is drawn in several
-            regions, one after the other; the image is the same to rounding.
+        memory_budget: bytes that lists of pairs may take before the image is drawn in several bands, one after the
+            other; the image is the same to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
 
     Returns:
@@ -200,15 +198,11 @@ def rasterization(
     means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
-    viewmats, Ks = on_cpu(viewmats), on_cpu(Ks)
-
+    limits = near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased"
     seen = [
-        project(
-            means, quats, scales, opacities, viewmats[c], Ks[c], width, height,
-            near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased", compiled,
-        )
-        for c in range(cameras)
-    ]  # fmt: skip
+        project(means, quats, scales, opacities, camera_of(viewmat, K, width, height, *limits), compiled)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
     skipped = count_meaningless(means, quats, scales, opacities)
     colored: list[Tensor] = []  # of each camera
     if render_mode.startswith("RGB"):
@@ -234,12 +228,11 @@ def rasterization(
     if absgrad:
         absolute = torch.zeros_like(meta_means2d.detach())
         setattr(meta_means2d, "absgrad", absolute)  # noqa: B010 - where gsplat puts it, on the tensor itself
-        rows = (torch.arange(len(dense_ids)).to(dense_ids) if packed else dense_ids).split(counts)
+        rows = (torch.cumsum(torch.ones_like(dense_ids), 0) - 1 if packed else dense_ids).split(counts)
     for c, own in enumerate(means2d.split(counts)):
         channels = [colored[c]] if colored else []
         if render_mode != "RGB":
             channels.append(seen[c].depths[:, None])
-
         one = replace(seen[c], means2d=own)
         absolute_of = (absolute.view(-1, 2), rows[c]) if absgrad else None
         values = _cat(channels, dim=-1)

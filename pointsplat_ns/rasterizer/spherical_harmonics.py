@@ -13,12 +13,6 @@ from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import full_precision
 
 
-def check_degree(degree: int) -> None:
-    """Raise a ValueError unless the degree is 0 to 3."""
-    if not 0 <= degree <= 3:
-        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
-
-
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
     """Gradient (3, M) by the unit direction, from the gradients ((degree + 1)^2, M) of the basis."""
     x, y, z = unit
@@ -148,7 +142,6 @@ def _call_kernels(
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
-    check_degree(degree)
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
 
 
@@ -172,7 +165,8 @@ def sh_to_color(
     Raises:
         ValueError: if the degree is not 0 to 3, or there are too few coefficients.
     """
-    check_degree(degree)
+    if not 0 <= degree <= 3:
+        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
     used, stored = (degree + 1) ** 2, 1 + rest.shape[1]
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")

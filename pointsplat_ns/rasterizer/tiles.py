@@ -1,11 +1,7 @@
 """The tiles that each Gaussian touches, exactly, in drawing order.
 
-A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel
-centres: for each row of tiles the ellipse's extent in x over that row is known in closed form, and
-the tiles it covers are an interval.
-
-An image is one region of tiles, or several bands of rows where its pairs would not fit a budget of memory. A tile's
-list does not depend on the region that it is part of.
+A Gaussian is paired with a tile only if its own 1/255 ellipse meets the box of the tile's pixel centres: over each row
+of tiles the ellipse's extent in x is known in closed form, and the tiles that it covers are an interval.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.system.kernels import KERNELS
 
 
-def _by_depth(depths: Tensor) -> Tensor:
+def by_depth(depths: Tensor) -> Tensor:
     """Rows in ascending order of depth, equal depths in the order of the input."""
     bits = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
     # integers, which are radix-sorted, with the order of the floats; bits of negative floats are in reverse order
@@ -53,7 +49,7 @@ class Footprints:
         shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
         self.compiled = KERNELS.usable_for(compiled, *shapes)
         self._engine = by_kernels if self.compiled else in_torch
-        order = _by_depth(seen.depth_keys.contiguous())
+        order = by_depth(seen.depth_keys.contiguous())
         self._ellipses = self._engine.ellipses_of(*shapes, order, self.grid)
 
     def regions(self, most_pairs: int) -> list[tuple[int, int]]:

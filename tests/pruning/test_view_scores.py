@@ -10,7 +10,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, log_determinant, pup_score, sensitivity
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.projection import camera_of, project
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT = 10, 9  # four tiles, three of them cut off
@@ -90,9 +90,8 @@ def hits_by_definition(scene, views):
     """For each Gaussian, the sum over the pixels that it is drawn on of the transmittance in front of it."""
     total = torch.zeros(len(scene), dtype=torch.float64)
     for i in range(len(views)):
-        seen = project(
-            scene.means, scene.quats, scene.stds, scene.alphas, views.viewmats[i], views.Ks[i], WIDTH, HEIGHT
-        )
+        camera = camera_of(views.viewmats[i], views.Ks[i], WIDTH, HEIGHT)
+        seen = project(scene.means, scene.quats, scene.stds, scene.alphas, camera)
         order = seen.depths.argsort()
         for y in range(HEIGHT):
             for x in range(WIDTH):

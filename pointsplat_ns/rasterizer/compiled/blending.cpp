@@ -5,6 +5,8 @@
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
 
+#include <type_traits>
+
 #include "lanes.h"
 
 namespace {
@@ -263,12 +265,15 @@ void each_gaussian(int64_t* next, int64_t count, Work work) {
     });
 }
 
-template <int D>
-void differentiate_all(const Task& task, int64_t* next) {
-    if (task.absolute)
-        each_tile(task, next, differentiate_tile<D, true>);
-    else
-        each_tile(task, next, differentiate_tile<D, false>);
+// Calls ``work`` with the number of channels as a constant.
+template <typename Work>
+void with_channels(int64_t channels, Work work) {
+    switch (channels) {
+        case 1: return work(std::integral_constant<int, 1>());
+        case 2: return work(std::integral_constant<int, 2>());
+        case 3: return work(std::integral_constant<int, 3>());
+        case 4: return work(std::integral_constant<int, 4>());
+    }
 }
 
 }  // namespace
@@ -278,21 +283,13 @@ extern "C" {
 int pointsplat_chunk() { return CHUNK; }
 
 void pointsplat_blend(const Task* task, int64_t* next) {
-    switch (task->channels) {
-        case 1: return each_tile(*task, next, blend_tile<1>);
-        case 2: return each_tile(*task, next, blend_tile<2>);
-        case 3: return each_tile(*task, next, blend_tile<3>);
-        case 4: return each_tile(*task, next, blend_tile<4>);
-    }
+    with_channels(task->channels, [&](auto d) { each_tile(*task, next, blend_tile<d>); });
 }
 
 void pointsplat_differentiate(const Task* task, int64_t* next) {
-    switch (task->channels) {
-        case 1: return differentiate_all<1>(*task, next);
-        case 2: return differentiate_all<2>(*task, next);
-        case 3: return differentiate_all<3>(*task, next);
-        case 4: return differentiate_all<4>(*task, next);
-    }
+    with_channels(task->channels, [&](auto d) {
+        each_tile(*task, next, task->absolute ? differentiate_tile<d, true> : differentiate_tile<d, false>);
+    });
 }
 
 // For colours of no channel: ``sums`` has one column.

@@ -39,19 +39,9 @@ def _task(ellipses: Ellipses, grid: Grid, top: int, bottom: int, **lists: Tensor
 def listed(
     ellipses: Ellipses, grid: Grid, top: int, bottom: int, counts: Tensor | None = None, most_pairs: float = math.inf
 ) -> tuple[Tensor, Tensor, Tensor | None] | None:
-    """The Gaussians that touch the tiles of the rows from ``top`` on before ``bottom``.
-
-    Args:
-        ellipses: M Gaussians.
-        grid: of the image.
-        top, bottom: rows of tiles.
-        counts: (M,) int64 zeros, to which the pairs of each Gaussian are added, in depth order.
-        most_pairs: largest number P of pairs of Gaussian and tile.
-
-    Returns:
-        Rows of the table by tile, front to back (P,), where those of each tile start (tiles + 1,), and, given
-        ``counts``, the places of :class:`TileList`, all int64; None if the pairs are too many.
-    """
+    """``gaussians`` and ``offsets`` of the :class:`TileList` of the rows of tiles from ``top`` to ``bottom`` - 1; its
+    ``places``, given ``counts`` (M,) of zeros, to which the pairs of each Gaussian are added; None if there are more
+    than ``most_pairs`` pairs."""
     first, last = ellipses.boxes[:, 0].clamp_min(top), ellipses.boxes[:, 1].clamp_max(bottom - 1)
     strips = torch.empty(int((last - first + 1).clamp_min_(0).sum()), 2, dtype=torch.int32, device="cpu")
     offsets = torch.zeros((bottom - top) * grid.columns + 1, **INDICES)
