@@ -1,15 +1,14 @@
 """EWA splatting with its hand-derived gradient: :func:`projection.project` in torch.
 
-Everything is held component by component, (components, M), so that each operation runs over contiguous
-memory; no matrices are built per Gaussian. With ``W`` the camera's rotation, ``R`` that of the Gaussian,
-``S`` its scales and ``J`` the Jacobian of the projection, the rows of ``J W`` are
+Everything is held component by component, (components, M), so that each operation runs over contiguous memory. With
+``W`` the camera's rotation, ``R`` that of the Gaussian, ``S`` its scales and ``J`` the Jacobian of the projection, the
+rows of ``J W`` are
 
     fx / z * a,  a = W[0] - tx W[2]        fy / z * b,  b = W[1] - ty W[2]
 
 and ``P = J W R S`` (2 x 3) has the rows ``p1 = fx / z * (R^T a) * s`` and ``p2 = fy / z * (R^T b) * s``.
-The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares,
-``det = |p1 x p2|^2 + eps2d (|p1|^2 + |p2|^2) + eps2d^2``, so that a needle does not lose it to
-cancellation as ``xx yy - xy^2`` does in float32.
+The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares, ``det = |p1 x p2|^2 + eps2d (|p1|^2 +
+|p2|^2) + eps2d^2``, so that a needle does not lose it to cancellation as ``xx yy - xy^2`` does in float32.
 """
 
 from __future__ import annotations

@@ -115,10 +115,9 @@ def rasterization(
     however far from the origin. Cameras are best given on the CPU: those on a GPU are fetched from it, which waits for
     all that it has to do.
 
-    Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian, an opacity
-    of 1 opaque. Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
-    6e30, whose gradients float32 could not hold) are not drawn, get a zero gradient and are counted in
-    ``meta["skipped"]``.
+    Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian. Gaussians with invalid
+    values (NaN, infinities, a negative scale or opacity, a colour above 6e30, whose gradients float32 could not hold)
+    are not drawn, get a zero gradient and are counted in ``meta["skipped"]``.
 
     The same input gives the same bits, forward and backward, on the same machine and number of threads; by compiled
     kernels on any number. Otherwise images and gradients move by 1e-6 of their size.
@@ -136,8 +135,7 @@ def rasterization(
         radius_clip: Gaussians of a smaller radius (pixels) are not drawn.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
         sh_degree: degree evaluated; must not exceed what ``colors`` holds.
-        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of
-            (C, N) arrays. The image is the same.
+        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of (C, N) arrays.
         backgrounds: (C, D), one colour a camera; depth channels are not composited over it.
         render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED`` (that
             divided by the accumulated alpha), or both.
@@ -154,10 +152,9 @@ def rasterization(
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
 
     Returns:
-        Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths,
-        conics, opacities (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids
-        (None unless packed), skipped (the number of Gaussians with invalid values; only colours of visible
-        Gaussians are checked), width, height, n_cameras, tile_size, tile_width and tile_height.
+        Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths, conics, opacities
+        (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids (None unless packed), skipped (the number
+        of Gaussians with invalid values; only colours of visible ones are checked), and sizes.
 
     Raises:
         ValueError: if a shape or option does not fit, or a camera has skew or is not a rigid motion; the text names the

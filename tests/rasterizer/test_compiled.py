@@ -74,8 +74,7 @@ def test_any_number_of_threads_draws_the_same_bits():
 
 
 def inputs(stored=17, n=500, m=300):
-    """Directions (M, 3) of any length, one of them zero, coefficients (N, K, 3), and rows in no order, float64 numbers
-    that float32 holds."""
+    """Directions (M, 3) of any length, one of them zero, coefficients (N, K, 3), and rows in no order."""
     g = torch.Generator().manual_seed(5)
     directions = torch.randn(m, 3, generator=g) * 10.0 ** torch.linspace(-20, 20, m)[:, None]
     directions[7] = 0

@@ -150,7 +150,6 @@ def test_the_differences_from_gsplat_are_those_that_the_page_lists():
 
 
 def test_gaussians_at_one_depth_are_drawn_in_the_order_given():
-    """The rows that come first are in front, as if the tie were broken by distances of no other consequence."""
     scene = splats_in_view(60, 4, spread=1.0, scale=-1.5)
     view, K = camera_askew()
     view[:3, :3] = torch.eye(3, dtype=F64)
