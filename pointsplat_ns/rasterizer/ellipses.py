@@ -48,6 +48,14 @@ class TileList(NamedTuple):
     top: int  # the first row of tiles
 
 
+def by_depth(depths: Tensor) -> Tensor:
+    """Rows in ascending order of depth, equal depths in the order of the input."""
+    bits = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
+    # integers, which are radix-sorted, with the order of the floats; bits of negative floats are in reverse order
+    bits = torch.where(bits < 0, bits ^ torch.iinfo(bits.dtype).max, bits)
+    return torch.sort(bits, stable=True).indices
+
+
 def ellipses_of(
     means2d: Tensor,  # [M, 2] pixels
     cov2d: Tensor,  # [M, 3] xx, xy, yy

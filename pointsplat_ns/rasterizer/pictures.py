@@ -17,7 +17,6 @@ from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET
 from pointsplat_ns.rasterizer.ellipses import Grid
 from pointsplat_ns.rasterizer.projection import Camera, count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
-from pointsplat_ns.rasterizer.tiles import by_depth
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
@@ -49,7 +48,7 @@ def _placed(
     )  # fmt: skip
     on_threads(count >= SEVERAL, library.pointsplat_place, task)
     rows = projection.kept_rows(counts)
-    order = ids[rows][by_depth(projection.depths_behind_nearest(depths[rows]))]
+    order = ids[rows][tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
     found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, most_pairs=MOST_PAIRS)
     if found is None:
         return None

@@ -7,7 +7,6 @@ of tiles the ellipse's extent in x is known in closed form, and the tiles that i
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from pointsplat_ns.rasterizer import ellipses as in_torch
 from pointsplat_ns.rasterizer.compiled import tiles as by_kernels
@@ -15,14 +14,6 @@ from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.rasterizer.ellipses import Grid, TileList
 from pointsplat_ns.rasterizer.projection import Projected
 from pointsplat_ns.system.kernels import KERNELS
-
-
-def by_depth(depths: Tensor) -> Tensor:
-    """Rows in ascending order of depth, equal depths in the order of the input."""
-    bits = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
-    # integers, which are radix-sorted, with the order of the floats; bits of negative floats are in reverse order
-    bits = torch.where(bits < 0, bits ^ torch.iinfo(bits.dtype).max, bits)
-    return torch.sort(bits, stable=True).indices
 
 
 class Footprints:
@@ -49,7 +40,7 @@ class Footprints:
         shapes = seen.means2d, seen.cov2d, seen.det, seen.opacities
         self.compiled = KERNELS.usable_for(compiled, *shapes)
         self._engine = by_kernels if self.compiled else in_torch
-        order = by_depth(seen.depth_keys.contiguous())
+        order = self._engine.by_depth(seen.depth_keys.contiguous())
         self._ellipses = self._engine.ellipses_of(*shapes, order, self.grid)
 
     def regions(self, most_pairs: int) -> list[tuple[int, int]]:

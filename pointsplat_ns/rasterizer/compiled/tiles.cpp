@@ -4,6 +4,7 @@
 // of pointsplat_tabulate. At an offset v across rows of pixels, the ellipse a w^2 + d v^2 = level within which one is drawn
 // reaches from r v - w to r v + w.
 
+#include <utility>
 #include <vector>
 
 #include "lanes.h"
@@ -94,6 +95,27 @@ void each_pair(const Listing& l, Before before, Visit visit) {
 }  // namespace
 
 extern "C" {
+
+// Writes the order of ``count`` depths, not negative, equal ones as they stand: sorted by three digits of 11 bits.
+void pointsplat_by_depth(const float* depths, int64_t count, int64_t* order) {
+    constexpr int DIGITS = 3, BITS = 11, VALUES = 1 << BITS;
+    std::vector<int64_t> values(count), other(count);  // bits of the depth, which are in its order, then the place
+    int32_t places[DIGITS][VALUES] = {};
+    const auto digit = [](int64_t value, int which) { return value >> (32 + BITS * which) & (VALUES - 1); };
+    for (int64_t i = 0; i < count; ++i) {
+        int32_t bits;
+        std::memcpy(&bits, depths + i, sizeof(bits));
+        values[i] = static_cast<int64_t>(bits) << 32 | i;
+        for (int which = 0; which < DIGITS; ++which) ++places[which][digit(values[i], which)];
+    }
+    for (int which = 0; which < DIGITS; ++which) {
+        int32_t sum = 0;
+        for (int32_t& place : places[which]) sum += std::exchange(place, sum);
+        for (int64_t value : values) other[places[which][digit(value, which)]++] = value;
+        values.swap(other);
+    }
+    for (int64_t i = 0; i < count; ++i) order[i] = values[i] & 0xffffffff;
+}
 
 // Writes boxes.
 void pointsplat_boxes(const Listing* listing, int64_t* next) {

@@ -16,6 +16,13 @@ from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import INDICES
 
 
+def by_depth(depths: Tensor) -> Tensor:
+    """As :func:`pointsplat_ns.rasterizer.ellipses.by_depth`, of depths that are not negative."""
+    order = torch.empty(len(depths), **INDICES)
+    KERNELS.library.pointsplat_by_depth(depths, len(depths), order)
+    return order
+
+
 def ellipses_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, order: Tensor, grid: Grid) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
     return boxed(inputs_of(means2d, cov2d, det, opacities, means2d[:, :0], grid.alpha_min), order, grid)
