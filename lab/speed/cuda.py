@@ -33,7 +33,7 @@ from lab.common.timing import seconds_of
 from lab.rooms import write_room
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.backends import gsplat_works
+from pointsplat_ns.rasterizer.rendering import gsplat_works
 
 SUPPORT = Path(__file__).parents[2] / "tests" / "support"
 """Where the golden pictures are made and compared."""

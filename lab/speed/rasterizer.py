@@ -26,7 +26,7 @@ from pointsplat_ns.metrics import psnr
 from pointsplat_ns.rasterizer import rasterization
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.pixel_walk import sum_over_pixels
-from pointsplat_ns.rasterizer.projection import project
+from pointsplat_ns.rasterizer.projection import camera_of, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.threads import one_thread
@@ -78,7 +78,7 @@ class Case:
     def time_blending(self) -> dict[str, float]:
         """Seconds of blending both ways as in training, compiled where it is so by default, without the lists of
         tiles, and of one exponential in numbers that stay in the cache, on one thread."""
-        seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
+        seen = project(*self.tensors[:4], camera_of(self.viewmat, self.K, self.width, self.height))
         colors = sh_to_color(seen.directions, self.tensors[4][:, 0], self.tensors[4][:, 1:], 3, seen.ids)
         leaves = [t.detach().requires_grad_() for t in (seen.means2d, seen.cov2d, seen.det, seen.opacities, colors)]
         seen = replace(seen, **dict(zip(("means2d", "cov2d", "det", "opacities"), leaves, strict=False)))
@@ -88,7 +88,7 @@ class Case:
         marks.append(now())
         torch.autograd.grad(drawn, leaves, (self.grads[0], -self.grads[1]))
         marks.append(now())
-        footprints.tiles(footprints.whole)
+        footprints.tiles()
         marks.append(now())
         numbers, calls = torch.full((2**12,), -1.0), 200
         with one_thread():
@@ -103,7 +103,7 @@ class Case:
     @torch.no_grad()
     def drawn(self) -> tuple[int, int]:
         """Gaussians that are drawn, and pairs of them and a pixel."""
-        seen = project(*self.tensors[:4], self.viewmat, self.K, self.width, self.height)
+        seen = project(*self.tensors[:4], camera_of(self.viewmat, self.K, self.width, self.height))
         counts = sum_over_pixels(
             seen, self.width, self.height, 1, lambda block: (block.alpha > 0).sum(-1, keepdim=True).to(block.alpha)
         )

@@ -13,7 +13,7 @@ from torch import Tensor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl, viewmats_to_opengl
 from pointsplat_ns.rasterizer import rasterization
-from pointsplat_ns.rasterizer.backends import use_gsplat
+from pointsplat_ns.rasterizer.rendering import use_gsplat
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, RasterizeMode, Views

@@ -5,8 +5,7 @@ A Gaussian is not drawn on a pixel where its alpha is lower than a threshold. Fr
 multiplies the transmittance by ``1 - alpha``; a pixel is finished before the Gaussian that would bring it to a second
 threshold or less. (3DGS, section 6; the thresholds stand in :mod:`~pointsplat_ns.rasterizer.constants`.)
 
-Every path in torch follows the rule by calling what stands here. The compiled kernels (``blending.cpp``) write it out
-once more, and so does ``lab/numerics/reference.py``, which checks both.
+The compiled kernels (``blending.cpp``) and ``lab/numerics/reference.py``, which checks both, write it out once more.
 
 Shapes: B tiles, S Gaussians of a chunk from front to back, 64 pixels of a tile.
 """

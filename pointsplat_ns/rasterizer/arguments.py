@@ -8,12 +8,6 @@ from torch import Tensor
 
 from pointsplat_ns.rasterizer.constants import QUALITIES
 
-NAMES = {
-    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
-    "rasterize_mode": ("classic", "antialiased"),
-    "quality": tuple(QUALITIES),
-}
-
 
 def check_tensors(
     colors: Tensor | tuple[Tensor, Tensor], sh_degree: int | None, backgrounds: Tensor | None, **tensors: Tensor
@@ -68,6 +62,11 @@ def check_options(width: int, height: int, near_plane: float, far_plane: float, 
             raise ValueError(f"{name} is {others[name]}; expected a number from 0")
     if not others["memory_budget"] > 0:
         raise ValueError(f"memory_budget is {others['memory_budget']}; expected a number of bytes above 0")
-    for name, names in NAMES.items():
+    modes = {
+        "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+        "rasterize_mode": ("classic", "antialiased"),
+        "quality": tuple(QUALITIES),
+    }
+    for name, names in modes.items():
         if others[name] not in names:
             raise ValueError(f"{name} is {others[name]!r}; expected {', '.join(names[:-1])} or {names[-1]}")

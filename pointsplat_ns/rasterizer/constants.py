@@ -10,8 +10,7 @@ TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or less."""
 
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian of the projection is evaluated no farther outside the image than this share of half
-its extent (0.3 makes the 1.3 x field of view of 3DGS)."""
+"""The Jacobian is evaluated no farther outside the image than this share of half its extent, as in 3DGS."""
 
 COMPENSATION_MIN = 0.005
 """Lower bound of the antialiasing compensation factor."""
@@ -22,15 +21,9 @@ TILE = 8
 SLACK = 1e-3
 """Pixels added around each ellipse, so that rounding never drops a pixel that is drawn."""
 
-
 QUALITIES = {"exact": ALPHA_MIN, "balanced": 2 / 255, "fast": 8 / 255}
-"""The lowest alpha that is drawn, by the name of a quality; what they gain and lose is measured by
-lab/speed/rasterizer.py. Only this threshold pays.
-
-A higher stop threshold skips the opaque Gaussian that would have finished a pixel, and is wrong by up to 0.5 where it
-does. A lower degree of the harmonics loses far more for less time. exp2 in bfloat16 takes twice the time of float32,
-and tiles of 16 pixels were slower than of 8.
-"""
+"""The lowest alpha that is drawn, by the name of a quality, measured by lab/speed/rasterizer.py. A higher stop
+threshold would skip the opaque Gaussian that finishes a pixel, and be wrong by up to 0.5 there."""
 
 MEMORY_BUDGET = 2**31
 """Bytes that the lists of pairs of one image may take before it is drawn in several regions."""

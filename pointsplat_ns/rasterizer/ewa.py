@@ -1,15 +1,14 @@
 """EWA splatting with its hand-derived gradient: :func:`projection.project` in torch.
 
-Everything is held component by component, (components, M), so that each operation runs over contiguous
-memory; no matrices are built per Gaussian. With ``W`` the camera's rotation, ``R`` that of the Gaussian,
-``S`` its scales and ``J`` the Jacobian of the projection, the rows of ``J W`` are
+Everything is held component by component, (components, M), so that each operation runs over contiguous memory. With
+``W`` the camera's rotation, ``R`` that of the Gaussian, ``S`` its scales and ``J`` the Jacobian of the projection, the
+rows of ``J W`` are
 
     fx / z * a,  a = W[0] - tx W[2]        fy / z * b,  b = W[1] - ty W[2]
 
 and ``P = J W R S`` (2 x 3) has the rows ``p1 = fx / z * (R^T a) * s`` and ``p2 = fy / z * (R^T b) * s``.
-The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares,
-``det = |p1 x p2|^2 + eps2d (|p1|^2 + |p2|^2) + eps2d^2``, so that a needle does not lose it to
-cancellation as ``xx yy - xy^2`` does in float32.
+The covariance is ``P P^T + eps2d I``. Its determinant is summed from squares, ``det = |p1 x p2|^2 + eps2d (|p1|^2 +
+|p2|^2) + eps2d^2``, so that a needle does not lose it to cancellation as ``xx yy - xy^2`` does in float32.
 """
 
 from __future__ import annotations
@@ -40,20 +39,18 @@ class Lens(NamedTuple):
     eps2d: float  # pixels^2
     antialiased: bool
 
-    def clamp_x(self) -> tuple[float, float]:
-        """Bounds of x / z where the Jacobian is evaluated: they follow the principal point (gsplat #305)."""
-        margin = FRUSTUM_MARGIN * 0.5 * self.width / self.fx
-        return _ordered(-(self.cx / self.fx + margin), (self.width - self.cx) / self.fx + margin)
-
-    def clamp_y(self) -> tuple[float, float]:
-        """Bounds of y / z, likewise."""
-        margin = FRUSTUM_MARGIN * 0.5 * self.height / self.fy
-        return _ordered(-(self.cy / self.fy + margin), (self.height - self.cy) / self.fy + margin)
+    def clamps(self) -> list[tuple[float, float]]:
+        """Bounds of x / z and y / z where the Jacobian is evaluated: they follow the principal point (gsplat #305)."""
+        bounds = []
+        for side, focal, middle in ((self.width, self.fx, self.cx), (self.height, self.fy, self.cy)):
+            margin = FRUSTUM_MARGIN * 0.5 * side / focal
+            ends = -(middle / focal + margin), (side - middle) / focal + margin
+            bounds.append((min(ends), max(ends)))  # a negative focal length mirrors
+        return bounds
 
     def steepness(self) -> float:
         """Bound of ``|J| z``, pixels: of the focal length times the length of (1, 1, clamp)."""
-        bounds = [abs(bound) for bound in (*self.clamp_x(), *self.clamp_y())]
-        return max(abs(self.fx), abs(self.fy)) * (1.0 + sum(bounds))
+        return max(abs(self.fx), abs(self.fy)) * (1.0 + sum(abs(bound) for ends in self.clamps() for bound in ends))
 
 
 def longest_axis(dtype: torch.dtype) -> float:
@@ -66,10 +63,6 @@ def longest_reach(dtype: torch.dtype, lens: Lens) -> float:
     """Largest standard deviation divided by depth: longer axes are drawn with this one, and have no gradient. No more
     than 1e-9 of an image would depend on them in float32."""
     return longest_axis(dtype) / lens.steepness()
-
-
-def _ordered(low: float, high: float) -> tuple[float, float]:
-    return (low, high) if low <= high else (high, low)  # the other way round where a focal length mirrors
 
 
 def _rotation_backward(quats: Tensor, a: Tensor, grad_a: Tensor, b: Tensor, grad_b: Tensor) -> Tensor:
@@ -130,7 +123,7 @@ class _Shape(NamedTuple):
 
 def _shape(slopes: Tensor, rz: Tensor, quats: Tensor, scales: Tensor, view: Tensor, lens: Lens) -> _Shape:
     """From x / z and y / z (2, M), 1 / z (M), unit quaternions (4, M) and scales (3, M)."""
-    tx, ty = slopes[0].clamp(*lens.clamp_x()), slopes[1].clamp(*lens.clamp_y())
+    tx, ty = (slope.clamp(*ends) for slope, ends in zip(slopes, lens.clamps(), strict=True))
     a = torch.addcmul(view[0, :, None], tx, view[2, :, None], value=-1)
     b = torch.addcmul(view[1, :, None], ty, view[2, :, None], value=-1)
     rotation = rotation_components(quats)
@@ -246,7 +239,7 @@ class Project(torch.autograd.Function):
         grad_a, grad_b = _times(transposed, grad_turned_a), _times(transposed, grad_turned_b)
 
         # x / z and y / z: once as the image position, once, where it is not clamped, in the Jacobian
-        (low_x, high_x), (low_y, high_y) = lens.clamp_x(), lens.clamp_y()
+        (low_x, high_x), (low_y, high_y) = lens.clamps()
         gx, gy = grad_means2d.T
         grad_u = lens.fx * gx - (view[2] @ grad_a) * ((slopes[0] >= low_x) & (slopes[0] <= high_x))
         grad_v = lens.fy * gy - (view[2] @ grad_b) * ((slopes[1] >= low_y) & (slopes[1] <= high_y))

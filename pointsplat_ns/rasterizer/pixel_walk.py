@@ -1,9 +1,7 @@
 """Sums over the pixels of a view, for each Gaussian, that no gradient of the picture gives.
 
-The rasterizer's own gradients give sums over pixels that are linear in the picture. How many pixels a
-Gaussian is drawn on, or the sum of squares of the gradients of each pixel, are not. This module walks the
-projected Gaussians of a view front to back, tile by tile, by the rasterizer's rules, and hands every pair of
-Gaussian and pixel to a function.
+Such as how many pixels a Gaussian is drawn on, or the sum of squares of the gradients of each pixel. The projected
+Gaussians of a view are walked front to back, tile by tile, by the rasterizer's rules.
 
 Shapes: M Gaussians seen, B tiles of a block, L Gaussians in the longest list of the block, 64 pixels a tile.
 """
@@ -52,9 +50,9 @@ def sum_over_pixels(
     """
     means2d, cov2d, det = seen.means2d.detach(), seen.cov2d.detach(), seen.det.detach()
     total = means2d.new_zeros(len(seen.ids), columns)
-    footprints = Footprints(seen, width, height)
-    lists = footprints.tiles(footprints.whole)
-    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.columns
+    footprints = Footprints(seen, width, height, compiled=False)
+    lists = footprints.tiles()
+    gaussians, starts, across = lists.gaussians, lists.offsets, footprints.grid.columns
     xx, xy, yy = cov2d.unbind(-1)
     # As the rasterizer keeps it: extent in x given y, and extent in y; both terms are positive.
     shapes = [*means2d.unbind(-1), yy / det, xy / yy, 1.0 / yy, seen.opacities.detach().log2()]

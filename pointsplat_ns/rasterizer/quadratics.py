@@ -1,14 +1,12 @@
 """The algebra of one Gaussian on one tile: log alpha as a quadratic, and the gradient sums that belong to it.
 
-For one tile and one Gaussian the logarithm of alpha is a quadratic in the pixel's offset (u, v) from
-the tile's centre. All evaluations, and all sums of gradients over pixels, are therefore products
-with one 6 x 64 matrix of monomials.
+For one tile and one Gaussian the logarithm of alpha is a quadratic in the pixel's offset (u, v) from the tile's centre.
+All evaluations, and all sums of gradients over pixels, are therefore products with one 6 x 64 matrix of monomials.
 
-The quadratic form is kept as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``,
-``a = yy / det``, ``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are
-positive, so a long needle far from its centre does not lose its alpha to the cancellation of huge
-terms. Logarithms are to base 2: torch's ``exp2`` was measured four times as fast as its ``exp``,
-which goes through MKL.
+The quadratic form is kept as ``a w^2 + d dv^2`` with ``w = du - r dv``, ``r = xy / yy``, ``a = yy / det``,
+``d = 1 / yy``: the extent in x given y, and the extent in y. Both terms are positive, so a long needle far from its
+centre does not lose its alpha to the cancellation of huge terms. Logarithms are to base 2, as torch's ``exp2`` is four
+times as fast as its ``exp``.
 
 Shapes: B tiles, S pairs of each, 64 = TILE * TILE pixels, D channels.
 """

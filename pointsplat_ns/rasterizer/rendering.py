@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import fields, replace
 from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.rasterizer.arguments import check_options, check_tensors
-from pointsplat_ns.rasterizer.backends import use_gsplat
 from pointsplat_ns.rasterizer.blending import blend
 from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET, QUALITIES, TILE
-from pointsplat_ns.rasterizer.projection import Projected, count_meaningless, on_cpu, project
+from pointsplat_ns.rasterizer.projection import Projected, camera_of, count_meaningless, project
 from pointsplat_ns.rasterizer.spherical_harmonics import sh_to_color
 from pointsplat_ns.rasterizer.tiles import Footprints
 from pointsplat_ns.system.tensors import full_precision
@@ -22,6 +23,32 @@ RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 QualityName = Literal["exact", "balanced", "fast"]
 Colors = Tensor | tuple[Tensor, Tensor]
 """Channels or SH coefficients; or the first SH coefficient of each Gaussian, (N, 3), and the others, (N, K - 1, 3)."""
+
+
+@functools.cache
+def gsplat_works() -> bool:
+    """Whether gsplat's CUDA kernels are there. The first call may compile them, as Splatfacto's first step does."""
+    if not torch.cuda.is_available():
+        return False
+    try:
+        from gsplat.cuda._backend import _C
+    except Exception:  # a failed compilation raises errors of many types
+        return False
+    return _C is not None
+
+
+def use_gsplat(backend: str, device: torch.device) -> bool:
+    """Whether ``backend`` ("gsplat" or "auto"; others are a ValueError) means gsplat for tensors on ``device``. Raises
+    PointSplatError if gsplat is asked for and cannot be used."""
+    if backend not in ("gsplat", "auto"):
+        raise ValueError(f"backend is {backend!r}; expected torch, gsplat or auto")
+    usable = device.type == "cuda" and gsplat_works()
+    if backend == "gsplat" and not usable:
+        raise PointSplatError(
+            f"backend gsplat: the Gaussians are on {device.type} and gsplat's CUDA kernels are "
+            f"{'there' if gsplat_works() else 'not there'}; expected both on CUDA; use auto or torch"
+        )
+    return usable
 
 
 def _cat(tensors: list[Tensor], dim: int = 0) -> Tensor:
@@ -82,57 +109,52 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict]:
     """Render 3D Gaussians from C pinhole cameras, on any torch device.
 
-    Called as ``gsplat.rasterization`` (1.4.0). ``distributed``, ``camera_model``, ``covars`` and SH of degree 4 are not
-    taken, and ``meta`` has no lists of tiles; docs/rasterizer.md lists all differences. Differentiable in means, quats,
-    scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as
-    they are, lower precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians
-    place the camera exactly, however far from the origin. Cameras are best given on the CPU, where they are computed
-    with in float64: those on a GPU are fetched from it, which waits for all that it has to do.
+    Called as ``gsplat.rasterization`` (1.4.0); docs/rasterizer.md lists the differences. Differentiable in means,
+    quats, scales, opacities, colors, backgrounds and viewmats. float32 and float64 are computed as they are, lower
+    precisions in float32, also under autocast. float64 viewmats beside float32 Gaussians place the camera exactly,
+    however far from the origin. Cameras are best given on the CPU: those on a GPU are fetched from it, which waits for
+    all that it has to do.
 
-    Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian, an opacity
-    of 1 opaque. Gaussians with invalid values (NaN, infinities, a negative scale or opacity, a colour above
-    6e30, whose gradients float32 could not hold) are not drawn, get a zero gradient and are counted in
-    ``meta["skipped"]``.
+    Degenerate input is drawn: the zero quaternion is the identity, a scale of 0 a flat Gaussian. Gaussians with invalid
+    values (NaN, infinities, a negative scale or opacity, a colour above 6e30, whose gradients float32 could not hold)
+    are not drawn, get a zero gradient and are counted in ``meta["skipped"]``.
 
-    The same input gives the same bits, forward and backward, on the same machine and number of threads. One thread and
-    two give the same image, and by compiled kernels the same gradients. Otherwise another number rounds in another way,
-    which moves images and gradients by 1e-6 of their size; so may another machine, device or version of torch.
+    The same input gives the same bits, forward and backward, on the same machine and number of threads; by compiled
+    kernels on any number. Otherwise images and gradients move by 1e-6 of their size.
 
     Args:
         means: centres, world space.
-        quats: wxyz, any length; the zero quaternion is the identity, and so is one of less than 1e-38.
+        quats: wxyz, any length; one of less than 1e-38 is the identity.
         scales: standard deviations (not logarithms), scene units.
         opacities: in [0, 1].
         colors: D channels, or SH coefficients if ``sh_degree`` is given: one tensor, or two with the first coefficient
-            and the others, as :class:`~pointsplat_ns.Gaussians` holds them, which saves taking them apart.
+            and the others.
         viewmats: world to camera, OpenCV axes (x right, y down, z forward), rigid.
         Ks: intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
         near_plane, far_plane: depths drawn, scene units.
         radius_clip: Gaussians of a smaller radius (pixels) are not drawn.
         eps2d: added to the diagonal of the projected covariance, pixels^2.
         sh_degree: degree evaluated; must not exceed what ``colors`` holds.
-        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of
-            (C, N) arrays. The image is the same.
+        packed: as in gsplat, ``meta`` then lists the M visible (camera, Gaussian) pairs in place of (C, N) arrays.
         backgrounds: (C, D), one colour a camera; depth channels are not composited over it.
         render_mode: colours, depth ``D`` (sum of weight times depth), expected depth ``ED`` (that
             divided by the accumulated alpha), or both.
-        absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of
-            the absolute gradient (AbsGS, arXiv 2404.10484).
+        absgrad: the backward pass adds the sum over pixels of the absolute gradient (AbsGS, arXiv 2404.10484) to
+            ``meta["means2d"].absgrad``.
         rasterize_mode: ``antialiased`` scales opacities by the compensation of Mip-Splatting.
         backend: renderer. "gsplat" calls gsplat itself, which needs CUDA; "auto" does so where it can. The arguments
             below have no effect on gsplat.
         quality: by which lowest alpha to trade accuracy for speed; see ``QUALITIES``.
         compiled: project and blend with compiled kernels, several times as fast as torch (CPU, float32; blending at
             most four channels): None where they were built; True warns where they were not; False never.
-        memory_budget: bytes that lists of pairs may take before the image is drawn in several
-            regions, one after the other; the image is the same to rounding.
+        memory_budget: bytes that lists of pairs may take before the image is drawn in several bands, one after the
+            other; the image is the same to rounding.
         tile_size, sparse_grad, channel_chunk: accepted for gsplat's sake, without effect.
 
     Returns:
-        Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths,
-        conics, opacities (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids
-        (None unless packed), skipped (the number of Gaussians with invalid values; only colours of visible
-        Gaussians are checked), width, height, n_cameras, tile_size, tile_width and tile_height.
+        Renders (C, H, W, channels), alphas (C, H, W, 1), and ``meta`` with means2d, radii, depths, conics, opacities
+        (all (C, N, ...), or (M, ...) if packed), camera_ids and gaussian_ids (None unless packed), skipped (the number
+        of Gaussians with invalid values; only colours of visible ones are checked), and sizes.
 
     Raises:
         ValueError: if a shape or option does not fit, or a camera has skew or is not a rigid motion; the text names the
@@ -173,15 +195,11 @@ def rasterization(
     means, quats, scales, opacities = (tensor.to(dtype) for tensor in (means, quats, scales, opacities))
     colors = colors.to(dtype) if isinstance(colors, Tensor) else (colors[0].to(dtype), colors[1].to(dtype))
     n, cameras = means.shape[0], viewmats.shape[0]
-    viewmats, Ks = on_cpu(viewmats), on_cpu(Ks)
-
+    limits = near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased"
     seen = [
-        project(
-            means, quats, scales, opacities, viewmats[c], Ks[c], width, height,
-            near_plane, far_plane, radius_clip, eps2d, rasterize_mode == "antialiased", compiled,
-        )
-        for c in range(cameras)
-    ]  # fmt: skip
+        project(means, quats, scales, opacities, camera_of(viewmat, K, width, height, *limits), compiled)
+        for viewmat, K in zip(viewmats, Ks, strict=True)
+    ]
     skipped = count_meaningless(means, quats, scales, opacities)
     colored: list[Tensor] = []  # of each camera
     if render_mode.startswith("RGB"):
@@ -203,23 +221,21 @@ def rasterization(
         means2d = meta_means2d.view(-1, 2).index_select(0, dense_ids)
 
     images, throughs = [], []
-    absolute: dict[int, Tensor] = {}
-    for c, own in enumerate(means2d.split([len(s.ids) for s in seen])):
+    counts = [len(s.ids) for s in seen]
+    if absgrad:
+        absolute = torch.zeros_like(meta_means2d.detach())
+        setattr(meta_means2d, "absgrad", absolute)  # noqa: B010 - where gsplat puts it, on the tensor itself
+        rows = (torch.cumsum(torch.ones_like(dense_ids), 0) - 1 if packed else dense_ids).split(counts)
+    for c, own in enumerate(means2d.split(counts)):
         channels = [colored[c]] if colored else []
         if render_mode != "RGB":
             channels.append(seen[c].depths[:, None])
-
-        def keep_absgrad(values: Tensor, c: int = c) -> None:
-            absolute[c] = values
-            if len(absolute) == cameras:
-                of_all = _cat([absolute.pop(camera) for camera in range(cameras)])
-                of_all = of_all if packed else dense(of_all)
-                setattr(meta_means2d, "absgrad", of_all)  # noqa: B010 - where gsplat puts it, on the tensor itself
-
         one = replace(seen[c], means2d=own)
-        footprints = Footprints(one, width, height, QUALITIES[quality], compiled)
-        absgrad_of = keep_absgrad if absgrad else None
-        image, through = blend(one, _cat(channels, dim=-1), footprints, compiled, memory_budget, absgrad_of)
+        absolute_of = (absolute.view(-1, 2), rows[c]) if absgrad else None
+        values = _cat(channels, dim=-1)
+        kernels = compiled if values.shape[1] <= 4 else False  # they are made for colours and depth
+        footprints = Footprints(one, width, height, QUALITIES[quality], kernels)
+        image, through = blend(one, values, footprints, memory_budget, absolute_of)
         images.append(image)
         throughs.append(through)
     image, through = torch.stack(images), torch.stack(throughs)
@@ -252,7 +268,7 @@ def rasterization(
         "height": height,
         "n_cameras": cameras,
         "tile_size": TILE,
-        "tile_width": footprints.columns,
-        "tile_height": footprints.rows,
+        "tile_width": footprints.grid.columns,
+        "tile_height": footprints.grid.rows,
     }
     return image, accumulated, meta

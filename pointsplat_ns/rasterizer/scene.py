@@ -11,14 +11,11 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import pictures
-from pointsplat_ns.rasterizer.constants import ALPHA_MIN, MEMORY_BUDGET, QUALITIES
-from pointsplat_ns.rasterizer.projection import camera_of, drawn_antialiased
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN, QUALITIES
+from pointsplat_ns.rasterizer.projection import camera_to, drawn_antialiased
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View, Views
-
-MOST_PAIRS = MEMORY_BUDGET // 16
-"""Largest number of pairs of Gaussian and tile in one pass, of 12 bytes each; pictures of more are drawn by regions."""
 
 
 def render(
@@ -72,38 +69,30 @@ def render_with_alpha(
 ) -> tuple[Tensor, Tensor]:
     """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
     :func:`render`."""
+    drawn = None
     with suitable_threads(scene.device):
         if backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
-            drawn = pictures.picture(scene, _camera(scene, view), QUALITIES[quality], MOST_PAIRS)
-            if drawn is not None:
-                image, alpha, skipped = drawn
-                _warn_of(skipped, scene)
-                return _over(image, alpha, view), alpha
-        colors = scene.features_dc, scene.features_rest
-        image, alpha = _rasterized(scene, view, colors, sh_degree=scene.sh_degree, quality=quality, backend=backend)
-        return _over(image, alpha, view), alpha
-
-
-def _over(image: Tensor, alpha: Tensor, view: View) -> Tensor:
-    """A picture (H, W, 3) over black with its alpha (H, W, 1) over the view's background, in [0, 1]."""
-    return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1)
-
-
-def _camera(scene: Gaussians, view: View) -> pictures.Camera:
-    return camera_of(
-        view.viewmat, view.K, view.width, view.height, view.near_plane, math.inf, 0.0, view.eps2d,
-        drawn_antialiased(scene, view),
-    )  # fmt: skip
+            drawn = pictures.picture(scene, camera_to(scene, view), QUALITIES[quality])
+        if drawn is None:
+            colors = scene.features_dc, scene.features_rest
+            options = {"sh_degree": scene.sh_degree, "quality": quality, "backend": backend}
+            image, alpha = _rasterized(scene, view, colors, **options)
+        else:
+            image, alpha, skipped = drawn
+            _warn_of(skipped, scene)
+        return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1), alpha
 
 
 def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
     """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
     :func:`~pointsplat_ns.rasterization` takes."""
+    with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
+        opacities = scene.alphas
     image, alpha, meta = rasterization(
         means=scene.means,
         quats=scene.quats,
         scales=scene.stds,
-        opacities=_alphas(scene),
+        opacities=opacities,
         colors=colors,
         viewmats=view.viewmat[None],
         Ks=view.K[None],
@@ -142,7 +131,7 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     :func:`pointsplat_ns.rasterization`."""
     with suitable_threads(scene.device):
         if pictures.can_draw(single := _at_least_single(scene), compiled):
-            weights = pictures.weights(single, _camera(scene, view), ALPHA_MIN, MOST_PAIRS)
+            weights = pictures.weights(single, camera_to(scene, view), ALPHA_MIN)
             if weights is not None:
                 return weights
     return pixel_sums(scene, view, single.means.new_ones(view.height, view.width, 1), compiled)[:, 0]
@@ -161,9 +150,3 @@ def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None
 
 def _at_least_single(scene: Gaussians) -> Gaussians:
     return scene.detach().to(torch.promote_types(scene.dtype, torch.float32))
-
-
-def _alphas(scene: Gaussians) -> Tensor:
-    """Opacities (N,). Where the shares of threads end, torch rounds a sigmoid in another way: so one computes all."""
-    with one_thread():
-        return scene.alphas

@@ -1,23 +1,16 @@
-"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled kernels
-(:mod:`~pointsplat_ns.rasterizer.compiled.colors`)."""
+"""Colours of Gaussians from real spherical harmonics up to degree 3: in torch, or by compiled kernels."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.geometry.harmonics import C1, C2, C3, SH_C0, basis_rows
 from pointsplat_ns.geometry.transforms import unit_rows
-from pointsplat_ns.rasterizer.compiled.colors import CompiledColor
-from pointsplat_ns.system.kernels import KERNELS
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import full_precision
-
-
-def check_degree(degree: int) -> None:
-    """Raise a ValueError unless the degree is 0 to 3."""
-    if not 0 <= degree <= 3:
-        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
 
 
 def _basis_backward(unit: Tensor, grad: Tensor, degree: int) -> Tensor:
@@ -100,9 +93,55 @@ def _rows(first: Tensor, rest: Tensor, ids: Tensor, degree: int) -> Tensor:
     return torch.cat([first.index_select(0, ids)[:, None], others], 1)
 
 
+class CompiledColor(torch.autograd.Function):
+    """As :class:`Color`, by compiled kernels (``compiled/colors.cpp``)."""
+
+    @staticmethod
+    def forward(ctx, directions, first, rest, ids, degree):
+        directions, first, rest, ids = (tensor.contiguous() for tensor in (directions, first, rest, ids))
+        if len(ids):
+            lowest, highest = ids.aminmax()
+            if lowest < 0 or highest >= len(first):
+                raise IndexError(f"ids are from {lowest} to {highest}; expected rows of {len(first)} Gaussians")
+        colors = torch.empty_like(directions)
+        _call_kernels(directions, first, rest, ids, degree, colors)
+        ctx.degree = degree
+        ctx.save_for_backward(directions, first, rest, ids, colors)
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        directions, first, rest, ids, colors = ctx.saved_tensors
+        wanted = ctx.needs_input_grad
+        # a constant has no direction
+        of_directions = torch.empty_like(directions) if wanted[0] and ctx.degree else None
+        of_first = _zeros_like(first) if wanted[1] else None
+        of_rest = _zeros_like(rest) if wanted[2] else None
+        _call_kernels(
+            directions, first, rest, ids, ctx.degree, colors,
+            grad_colors=grad.contiguous(), grad_directions=of_directions, grad_first=of_first, grad_rest=of_rest,
+        )  # fmt: skip
+        return of_directions, of_first, of_rest, None, None
+
+
+def _zeros_like(coefficients: Tensor) -> Tensor:
+    """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not written, nor paid for."""
+    return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
+
+
+def _call_kernels(
+    directions: Tensor, first: Tensor, rest: Tensor, ids: Tensor, degree: int, colors: Tensor, **grads: Tensor | None
+) -> None:
+    task = KERNELS.structs["Colors"](
+        directions=directions, first=first, rest=rest, rest_row=3 * rest.shape[1], ids=ids, count=len(ids),
+        degree=degree, colors=colors, **grads,
+    )  # fmt: skip
+    on_threads(len(ids) >= SEVERAL, KERNELS.library.pointsplat_color, task)
+
+
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Basis values (M, (degree + 1)^2) for unit directions (M, 3), world space, and a degree of 0 to 3."""
-    check_degree(degree)
     return torch.stack(basis_rows(directions.movedim(-1, 0), degree), dim=-1)
 
 
@@ -126,7 +165,8 @@ def sh_to_color(
     Raises:
         ValueError: if the degree is not 0 to 3, or there are too few coefficients.
     """
-    check_degree(degree)
+    if not 0 <= degree <= 3:
+        raise ValueError(f"sh_degree is {degree}; expected 0 to 3")
     used, stored = (degree + 1) ** 2, 1 + rest.shape[1]
     if stored < used:
         raise ValueError(f"{stored} SH coefficients given; degree {degree} needs {used}")

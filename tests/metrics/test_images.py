@@ -34,12 +34,6 @@ def test_ssim_in_float32_is_that_of_float64_on_extreme_images():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_gradients_agree_with_float64_differences(metric):
-    a, b = pair(12, 13, dtype=torch.float64)
-    assert torch.autograd.gradcheck(metric, (a.requires_grad_(), b.requires_grad_()), fast_mode=True)
-
-
-@pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [
@@ -131,7 +125,5 @@ def test_a_pixel_that_is_not_finite_spoils_only_its_windows():
 
 
 def test_images_below_the_window_are_said():
-    with pytest.raises(
-        ImageError, match="images of 20 x 10 pixels are smaller than SSIM's window; expected at least 11 x 11"
-    ):
+    with pytest.raises(ImageError, match="20 x 10 pixels are smaller than SSIM's window; expected at least 11 x 11"):
         ssim(torch.rand(10, 20, 3), torch.rand(10, 20, 3))

@@ -119,8 +119,6 @@ def test_the_smallest_image_works_and_smaller_ones_are_refused(net, tmp_path):
     assert model(*pair(least, least + 5)).isfinite()
     with pytest.raises(ImageError, match=f"images of {least} x {least - 1} pixels are too small for LPIPS with {net}"):
         model(*pair(least - 1, least))
-    with pytest.raises(ImageError, match=r"pred has shape \(3, 40, 40\)"):
-        model(torch.rand(3, 40, 40), torch.rand(3, 40, 40))
 
 
 def test_a_report_has_the_value_or_the_reason_why_there_is_none(alex_file, alex, nowhere, tmp_path):

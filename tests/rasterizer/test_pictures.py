@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from making import assert_same_on_any_threads, normal_scene
-from pointsplat_ns.rasterizer import pictures, pixels_of, rasterization, render
+from pointsplat_ns.rasterizer import pictures, pixels_of, render
 from pointsplat_ns.rasterizer import scene as drawing
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.views import View
@@ -29,24 +29,6 @@ def view_of(mode="classic"):
     return View(torch.eye(4).double(), K, WIDTH, HEIGHT, rasterize_mode=mode, background=torch.tensor([0.2, 0.5, 0.9]))
 
 
-def by_torch(scene, view, dtype=torch.float64):
-    """The picture over the view's background, its alpha, and the pixels of each Gaussian, in torch."""
-    scene = scene.to(dtype)
-    flat = torch.zeros(len(scene), 4, dtype=dtype, requires_grad=True)
-
-    def drawn(colors, **options):
-        return rasterization(
-            scene.means, scene.quats, scene.stds, scene.alphas, colors, view.viewmat[None], view.K[None].to(dtype),
-            WIDTH, HEIGHT, near_plane=view.near_plane, far_plane=math.inf, eps2d=view.eps2d,
-            rasterize_mode=view.rasterize_mode, compiled=False, **options,
-        )  # fmt: skip
-
-    (pixels,) = torch.autograd.grad(drawn(flat[:, :1])[0].sum(), flat)
-    image, alpha, _ = drawn((scene.features_dc, scene.features_rest), sh_degree=scene.sh_degree)
-    image = (image + (1 - alpha) * view.background.to(dtype)).clamp(0, 1)
-    return image[0], alpha[0], pixels[:, 0]
-
-
 def _far(scene, view):
     shift = torch.tensor([1e6, -7e5, 4e5], dtype=torch.float64)
     means = (scene.means * 64 + shift).float()
@@ -59,17 +41,15 @@ def _needles(scene, view):
     return scene.replace(scales=torch.tensor([0.0, -9.0, -9.0]).expand(len(scene), 3).contiguous()), view
 
 
-def _large(scene, view):
-    return scene.replace(scales=scene.scales + 4), view
-
-
-def _tiny(scene, view):
-    return scene.replace(scales=scene.scales - 8), view
+def _large_and_tiny(scene, view):
+    scales = scene.scales + 4
+    scales[::2] -= 12
+    return scene.replace(scales=scales), view
 
 
 def _meaningless(scene, view):
     tensors = [value.clone() for value in scene.tensors()]
-    for i, wrong in enumerate((math.nan, math.inf, -math.inf, 1e38)):
+    for i, wrong in enumerate((math.nan, math.inf, -math.inf)):
         for j, tensor in enumerate(tensors):
             rows = tensor[60 * i + 10 * j : 60 * i + 10 * j + 10].view(10, -1)
             rows[torch.arange(10), torch.arange(10) % rows.shape[1]] = wrong
@@ -82,11 +62,7 @@ def _at_one_depth(scene, view):
     return scene.replace(means=means), view
 
 
-def _behind(scene, view):
-    return scene.replace(means=scene.means * torch.tensor([1.0, 1.0, -1.0]) - 3), view
-
-
-CHANGES = [_far, _needles, _large, _tiny, _meaningless, _at_one_depth, _behind]
+CHANGES = [_far, _needles, _large_and_tiny, _meaningless, _at_one_depth]
 
 
 @needs_compiler
@@ -96,11 +72,11 @@ CHANGES = [_far, _needles, _large, _tiny, _meaningless, _at_one_depth, _behind]
 def test_pictures_and_pixels_are_those_of_torch(change, mode):
     scene, view = scene_of(), view_of(mode)
     scene, view = change(scene, view) if change else (scene, view)
-    assert pictures.can_draw(scene, None)
+    assert pictures.can_draw(scene, None) and not pictures.can_draw(scene.to(torch.float64), None)
     image, alpha = drawing.render_with_alpha(scene, view)
-    dtype = torch.float32 if change is _meaningless else torch.float64  # which holds colours that float32 does not
-    with torch.enable_grad():
-        wanted, wanted_alpha, wanted_pixels = by_torch(scene, view, dtype)
+    wanted, wanted_alpha = drawing.render_with_alpha(scene.to(torch.float64), view)  # which torch draws
+    wanted_pixels = pixels_of(scene.to(torch.float64), view)
+    assert wanted_alpha.any()
     # float32 against float64: a pixel at the threshold of 1/255 may fall either way, and then differs by so much
     for ours, torchs in ((image, wanted), (alpha, wanted_alpha)):
         off = (ours - torchs).abs()
@@ -108,7 +84,6 @@ def test_pictures_and_pixels_are_those_of_torch(change, mode):
     for compiled in (None, False):
         pixels = pixels_of(scene, view, compiled)
         assert ((pixels - wanted_pixels).abs() > 1e-3 * (1 + wanted_pixels)).float().mean() < 0.02
-    assert (float(alpha.sum()) == 0.0) == (change is _behind)
 
 
 @needs_compiler
@@ -118,7 +93,7 @@ def test_pictures_and_pixels_are_those_of_torch(change, mode):
 def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monkeypatch):
     scene, view = scene_of(degree), view_of()
     at_once, pixels = drawing.render_with_alpha(scene, view, quality), pixels_of(scene, view)
-    monkeypatch.setattr(drawing, "MOST_PAIRS", 10)  # as a picture of too many pairs is drawn
+    monkeypatch.setattr(pictures, "MOST_PAIRS", 10)  # as a picture of too many pairs is drawn
     for ours, others in zip(at_once, drawing.render_with_alpha(scene, view, quality), strict=True):
         torch.testing.assert_close(ours, others, rtol=0, atol=1e-6)
     torch.testing.assert_close(pixels_of(scene, view), pixels, rtol=1e-5, atol=1e-4)
@@ -129,18 +104,6 @@ def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monk
 def test_pictures_are_the_same_on_any_threads():
     scene, view = scene_of(count=12_000), view_of()
     assert_same_on_any_threads(lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)])
-
-
-@needs_compiler
-def test_gradients_and_other_precisions_are_left_to_the_general_way():
-    scene, view = scene_of(1, 50), view_of()
-    leaf = scene.replace(features_dc=scene.features_dc.clone().requires_grad_())
-    assert not pictures.can_draw(leaf, None) and not pictures.can_draw(scene.to(torch.float64), None)
-    assert not pictures.can_draw(scene, False) and pictures.can_draw(scene, None)
-    render(leaf, view).sum().backward()
-    assert leaf.features_dc.grad.abs().sum() > 0
-    with torch.no_grad():
-        assert pictures.can_draw(leaf, None)
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -1,4 +1,1 @@
-"""The rasterizer's inner loops in C++, for float32 on a CPU where they were built; elsewhere torch does the same.
-
-Each module calls the C++ file of its name.
-"""
+"""The rasterizer's inner loops in C++, for float32 on a CPU where they were built; elsewhere torch does the same."""

@@ -5,6 +5,8 @@
 // row of them is one vector. Each tile is drawn by one thread from front to back, so that the number of threads changes
 // nothing.
 
+#include <type_traits>
+
 #include "lanes.h"
 
 namespace {
@@ -36,13 +38,13 @@ inline void store(float* to, Row row) { std::memcpy(to, &row, sizeof(Row)); }
 
 extern "C" {
 
-// Input and output of blending. Tiles are those of a region of one or several images of equal size, row by row.
+// Input and output of blending. Tiles are those of some rows of tiles of an image, row by row.
 struct Task {
     const float* table;        // [M, COLOR + channels], of pointsplat_tabulate
     const int64_t* gaussians;  // [P] rows of the table, by tile and front to back
     const int64_t* offsets;    // [tiles + 1] where each tile's Gaussians start
     const int64_t* chunks;     // [tiles + 1] where each tile's chunks start
-    int64_t tiles, columns, top, left, width, height, channels;
+    int64_t tiles, columns, top, width, height, channels;
     float log2_alpha_min, alpha_min, alpha_max, clamped_from, transmittance_min;
     float* image;        // [tiles, channels, PIXELS]
     float* final_;       // [tiles, PIXELS] transmittance left
@@ -104,7 +106,7 @@ struct Place {
 };
 
 Place place_of(const Task& task, int64_t tile) {
-    const int64_t top = (task.top + tile / task.columns) * TILE, left = (task.left + tile % task.columns) * TILE;
+    const int64_t top = (task.top + tile / task.columns) * TILE, left = tile % task.columns * TILE;
     Place place{static_cast<float>(left + TILE / 2), static_cast<float>(top + TILE / 2), {}};
     for (int row = 0; row < TILE; ++row)
         for (int column = 0; column < TILE; ++column)
@@ -263,12 +265,15 @@ void each_gaussian(int64_t* next, int64_t count, Work work) {
     });
 }
 
-template <int D>
-void differentiate_all(const Task& task, int64_t* next) {
-    if (task.absolute)
-        each_tile(task, next, differentiate_tile<D, true>);
-    else
-        each_tile(task, next, differentiate_tile<D, false>);
+// Calls ``work`` with the number of channels as a constant.
+template <typename Work>
+void with_channels(int64_t channels, Work work) {
+    switch (channels) {
+        case 1: return work(std::integral_constant<int, 1>());
+        case 2: return work(std::integral_constant<int, 2>());
+        case 3: return work(std::integral_constant<int, 3>());
+        case 4: return work(std::integral_constant<int, 4>());
+    }
 }
 
 }  // namespace
@@ -278,21 +283,13 @@ extern "C" {
 int pointsplat_chunk() { return CHUNK; }
 
 void pointsplat_blend(const Task* task, int64_t* next) {
-    switch (task->channels) {
-        case 1: return each_tile(*task, next, blend_tile<1>);
-        case 2: return each_tile(*task, next, blend_tile<2>);
-        case 3: return each_tile(*task, next, blend_tile<3>);
-        case 4: return each_tile(*task, next, blend_tile<4>);
-    }
+    with_channels(task->channels, [&](auto d) { each_tile(*task, next, blend_tile<d>); });
 }
 
 void pointsplat_differentiate(const Task* task, int64_t* next) {
-    switch (task->channels) {
-        case 1: return differentiate_all<1>(*task, next);
-        case 2: return differentiate_all<2>(*task, next);
-        case 3: return differentiate_all<3>(*task, next);
-        case 4: return differentiate_all<4>(*task, next);
-    }
+    with_channels(task->channels, [&](auto d) {
+        each_tile(*task, next, task->absolute ? differentiate_tile<d, true> : differentiate_tile<d, false>);
+    });
 }
 
 // For colours of no channel: ``sums`` has one column.

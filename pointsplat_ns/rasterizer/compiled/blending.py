@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pointsplat_ns.rasterizer.alpha import CLAMPED
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
-from pointsplat_ns.rasterizer.ellipses import Region
+from pointsplat_ns.rasterizer.ellipses import Grid, TileList
 from pointsplat_ns.rasterizer.quadratics import MOMENTS, PIXELS
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import FLOATS, INDICES
-
-if TYPE_CHECKING:
-    from pointsplat_ns.rasterizer.tiles import Footprints, TileList
-
-
-class KernelInputs(NamedTuple):
-    """Projected Gaussians in the kernels' layout."""
-
-    table: Tensor  # [M, 6 + D]
-    channels: int
-    alpha_min: float
 
 
 class KernelTape(NamedTuple):
@@ -35,21 +24,15 @@ class KernelTape(NamedTuple):
     chunks: Tensor  # [tiles + 1] int64, where each tile's chunks start
 
 
-def can_blend(colors: Tensor, wanted: bool | None) -> bool:
-    """Whether the kernels, which are made for colours and depth, blend these colours (M, D). ``wanted`` as for
-    :meth:`~pointsplat_ns.system.kernels.Kernels.usable_for`."""
-    return 1 <= colors.shape[1] <= 4 and KERNELS.usable_for(wanted, colors)
-
-
 def inputs_of(
-    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, alpha_min: float
-) -> KernelInputs:
-    """As :func:`~pointsplat_ns.rasterizer.eager.inputs_of`, without what only torch needs."""
+    means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, colors: Tensor, _alpha_min: float
+) -> Tensor:
+    """Table of projected Gaussians as the kernels read them, (M, 6 + D): geometry, then the colours (M, D)."""
     count, channels = colors.shape
     tensors = [tensor.contiguous() for tensor in (means2d, cov2d, det, opacities, colors)]
-    table = colors.new_empty(count, 6 + channels)  # six columns of geometry, then the colours
+    table = colors.new_empty(count, 6 + channels)
     on_threads(count >= SEVERAL, KERNELS.library.pointsplat_tabulate, *tensors, count, channels, table)
-    return KernelInputs(table, channels, alpha_min)
+    return table
 
 
 def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list[Tensor]:
@@ -64,33 +47,27 @@ def chain(summed: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor) -> list
     return grads
 
 
-def task_of(
-    size: tuple[int, int], region: Region, gaussians: Tensor, offsets: Tensor, inputs: KernelInputs, chunks: Tensor
-) -> Struct:
-    """The task of drawing a region of an image of a size (width and height, pixels), without its output.
+def task_of(table: Tensor, grid: Grid, gaussians: Tensor, offsets: Tensor, chunks: Tensor, top: int = 0) -> Struct:
+    """The task of drawing some rows of tiles, without its output.
 
     Args:
-        size, region: of the image.
-        gaussians: (P,) int64, rows of the inputs' table, by tile and front to back.
+        table: of :func:`inputs_of`.
+        grid: of the image.
+        gaussians: (P,) int64, rows of the table, by tile and front to back.
         offsets: (tiles + 1,) int64, where those of each tile start.
-        inputs: the Gaussians.
         chunks: (tiles + 1,) int64, where the chunks of each tile start; any where no tape is kept.
+        top: the first row of tiles.
     """
     return KERNELS.structs["Task"](
-        table=inputs.table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
-        columns=region.columns, top=region.top, left=region.left, width=size[0], height=size[1],
-        channels=inputs.channels, log2_alpha_min=math.log2(inputs.alpha_min), alpha_min=inputs.alpha_min,
+        table=table, gaussians=gaussians, offsets=offsets, chunks=chunks, tiles=offsets.numel() - 1,
+        columns=grid.columns, top=top, width=grid.width, height=grid.height, channels=table.shape[1] - 6,
+        log2_alpha_min=math.log2(grid.alpha_min), alpha_min=grid.alpha_min,
         alpha_max=ALPHA_MAX, clamped_from=CLAMPED, transmittance_min=TRANSMITTANCE_MIN,
     )  # fmt: skip
 
 
-def _task(footprints: Footprints, tiles: TileList, inputs: KernelInputs, chunks: Tensor) -> Struct:
-    size = footprints.width, footprints.height
-    return task_of(size, tiles.region, tiles.gaussians, tiles.offsets, inputs, chunks)
-
-
 def blend_region(
-    footprints: Footprints, tiles: TileList, inputs: KernelInputs, image: Tensor, final: Tensor, keep_tape: bool
+    grid: Grid, tiles: TileList, table: Tensor, image: Tensor, final: Tensor, keep_tape: bool
 ) -> KernelTape | None:
     """Blend the tiles of a region into ``image`` (tiles, D, 64) and ``final`` (tiles, 64); the tape if it is wanted."""
     library = KERNELS.library
@@ -99,7 +76,7 @@ def blend_region(
     torch.cumsum((tiles.offsets.diff() + (size - 1)).div_(size, rounding_mode="floor"), 0, out=chunks[1:])
     before = image.new_empty(int(chunks[-1]) if keep_tape else 0, PIXELS)
     blended = torch.empty_like(tiles.offsets[1:])
-    task = _task(footprints, tiles, inputs, chunks)
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, chunks, tiles.top)
     task.fill(image=image, final_=final, blended=blended, before=before if keep_tape and len(before) else None)
     on_threads(tiles.gaussians.numel() >= SEVERAL, library.pointsplat_blend, task)
     return KernelTape(before, blended, chunks) if keep_tape else None
@@ -116,9 +93,9 @@ def weigh(task: Struct, pairs: Tensor, count: int) -> Tensor:
 
 
 def differentiate_region(
-    footprints: Footprints,
+    grid: Grid,
     tiles: TileList,
-    inputs: KernelInputs,
+    table: Tensor,
     tape: KernelTape,
     final: Tensor,  # [tiles, 64]
     grad_image: Tensor,  # [tiles, D, 64]
@@ -128,9 +105,9 @@ def differentiate_region(
     """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
     library = KERNELS.library
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
-    columns = MOMENTS + inputs.channels + (2 if absgrad else 0)
+    columns = MOMENTS + table.shape[1] - 6 + (2 if absgrad else 0)
     sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
-    task = _task(footprints, tiles, inputs, tape.chunks)
+    task = task_of(table, grid, tiles.gaussians, tiles.offsets, tape.chunks, tiles.top)
     task.fill(
         final_=final, before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),
         grad_final=grad_final.contiguous(), sums=sums, absolute=int(absgrad),

@@ -1,7 +1,7 @@
 // Colours of Gaussians by spherical harmonics, for float32 on a CPU, and their gradients.
 //
-// colors.py calls this file where it was built; spherical_harmonics.py does the same in
-// torch, says where the formulas are from, and has the names that are used here. Threads take ranges of Gaussians, and
+// spherical_harmonics.py calls this file where it was built, does the same in torch, and has the names that are used
+// here; geometry/harmonics.py says where the formulas are from. Threads take ranges of Gaussians, and
 // nothing is summed across Gaussians, so that the number of threads changes nothing.
 
 #include "harmonics.h"

@@ -1,13 +1,9 @@
-// What one camera draws on which tile, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
+// What one camera draws, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
 //
-// pictures.py calls this file where it was built, then blends as for any picture. It does what
-// projection.cpp, colors.cpp and tiles.cpp do one after the other, without what lies between.
-
-#include <utility>
-#include <vector>
+// pictures.py calls this file where it was built, then lists the tiles and blends as for any picture. It does what
+// projection.cpp and colors.cpp do one after the other, without what lies between.
 
 #include "camera.h"
-#include "extent.h"
 #include "harmonics.h"
 
 extern "C" {
@@ -17,27 +13,18 @@ struct Placing {
     Scene scene;
     const float *first, *rest;       // SH coefficients, [N, 3] and [N, K - 1, 3]
     int64_t rest_row, degree;        // numbers of the others of a Gaussian; degree of the basis, -1 for no colours
-    int64_t rows, columns;           // of tiles
-    float log2_alpha_min, slack, most_color;
+    float most_color;
     float* table;      // [N, 6 + channels], as of pointsplat_tabulate; rows of Gaussians that are not drawn stay as they are
-    int32_t* ids;      // [N] Gaussians that are drawn, those of each range from where the range begins
+    int64_t* ids;      // [N] Gaussians that are drawn, those of each range from where the range begins
     double* depths;    // [N] of these
-    int32_t* boxes;    // [N, 4] first and last row of tiles, first and last column
     int64_t* counts;   // [ranges] how many are drawn
-    int64_t* heights;  // [ranges] sum of the rows of their boxes
-    double* nearest;   // [ranges] least depth
-    int64_t* order;    // [M] places of the Gaussians that are drawn, front to back
-    Strip* strips;     // [rows of all boxes] in this order
-    int64_t* offsets;  // [tiles + 1] where each tile's pairs start; before, in the next place, how many there are
-    int64_t* pairs;    // [P] the Gaussians of each tile, front to back
 };
 
 }  // extern "C"
 
 namespace {
 
-constexpr int GEOMETRY = 6;    // columns of the table before the colours
-constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
+constexpr int GEOMETRY = 6;  // columns of the table before the colours
 
 // Colours of up to eight Gaussians; NaN where a coefficient is not finite.
 template <int DEGREE>
@@ -62,8 +49,6 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
     const Position at(camera, lanes, task.scene.means);
     const Flat flat(camera, at, Shape(camera, at, lanes, task.scene), lanes.load(task.scene.opacities));
     const Lane base = each(flat.alpha, [](float value) { return std::log2(value); });
-    const Lane level = (2.0f * LN2) * larger(base - task.log2_alpha_min, ZERO);  // squared Mahalanobis distance
-    const Lane half_x = root(level * flat.xx) + task.slack, half_y = root(level * flat.yy) + task.slack;
     const Lane rows[GEOMETRY] = {flat.x, flat.y, flat.xy / flat.yy, LOG2E * flat.yy / flat.det, LOG2E / flat.yy, base};
     float colors[LANES][3];
     if constexpr (DEGREE >= 0) color_lanes<DEGREE>(task, lanes, at, colors);
@@ -72,17 +57,10 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
         bool usable = true;  // no colour is NaN
         for (int c = 0; c < CHANNELS; ++c) usable &= colors[lane][c] < task.most_color;
         if (!usable) continue;
-        const float x = flat.x[lane], y = flat.y[lane];
-        int32_t* box = task.boxes + 4 * to;
-        box[0] = static_cast<int32_t>(tile_from(y - half_y[lane], task.rows));
-        box[1] = static_cast<int32_t>(tile_to(y + half_y[lane], task.rows));
-        box[2] = static_cast<int32_t>(tile_from(x - half_x[lane], task.columns));
-        box[3] = static_cast<int32_t>(tile_to(x + half_x[lane], task.columns));
-        if (box[0] > box[1] || box[2] > box[3]) continue;
         float* row = task.table + COLUMNS * lanes.rows[lane];
         for (int i = 0; i < GEOMETRY; ++i) row[i] = rows[i][lane];
         for (int c = 0; c < CHANNELS; ++c) row[GEOMETRY + c] = colors[lane][c];
-        task.ids[to] = static_cast<int32_t>(lanes.rows[lane]), task.depths[to] = at.point[2][lane];
+        task.ids[to] = lanes.rows[lane], task.depths[to] = at.point[2][lane];
         ++to;
     }
     return to;
@@ -101,79 +79,13 @@ void place_all(const Placing& task, int64_t* next) {
             to = place_lanes<DEGREE>(task, lanes, to);
         }
         task.counts[range] = to - first;
-        task.nearest[range] = std::numeric_limits<double>::infinity(), task.heights[range] = 0;
-        for (int64_t i = first; i < to; ++i) {
-            task.nearest[range] = std::min(task.nearest[range], task.depths[i]);
-            task.heights[range] += task.boxes[4 * i + 1] - task.boxes[4 * i] + 1;
-        }
     });
-}
-
-// Writes the strips of a Gaussian by its place: the columns in each row of tiles of its box.
-void write_strips(const Placing& task, int64_t i, Strip* strips) {
-    const int32_t* box = task.boxes + 4 * i;
-    if (box[2] == box[3] || box[0] == box[1]) {  // the ellipse touches all tiles of its box
-        std::fill(strips, strips + (box[1] - box[0] + 1), Strip{box[2], box[3]});
-        return;
-    }
-    // In a row of tiles the ellipse a w^2 + d v^2 = 2 level reaches from r v - w to r v + w, at the v of the row that is
-    // nearest to where it is widest.
-    const float* s = task.table + (GEOMETRY + (task.degree < 0 ? 0 : 3)) * static_cast<int64_t>(task.ids[i]);
-    const float x = s[0], y = s[1], r = s[2], a = s[3], d = s[4];
-    const float level = 2.0f * std::max(s[5] - task.log2_alpha_min, 0.0f);
-    const float widest = r * std::sqrt(level / (d * (d / a + r * r)));
-    for (int32_t row = box[0]; row <= box[1]; ++row) {
-        const float top = row * TILE + (0.5f - task.slack) - y;
-        const float bottom = std::min(row * TILE + (TILE - 0.5f), task.camera.height - 0.5f) + task.slack - y;
-        const auto edge = [&](float v, float sign) {
-            v = std::min(std::max(v, top), bottom);
-            return x + r * v + sign * (std::sqrt(std::max(level - d * v * v, 0.0f) / a) + task.slack);
-        };
-        *strips++ = {static_cast<int32_t>(tile_from(edge(-widest, -1.0f), task.columns)),
-                     static_cast<int32_t>(tile_to(edge(widest, 1.0f), task.columns))};
-    }
-}
-
-// Calls ``visit`` with each Gaussian and each tile that its strips touch, front to back; ``before`` first, with its place
-// and its strips.
-template <typename Before, typename Visit>
-void each_pair(const Placing& task, int64_t drawn, Before before, Visit visit) {
-    Strip* strips = task.strips;
-    for (int64_t at = 0; at < drawn; ++at) {
-        const int64_t i = task.order[at], ahead = task.order[std::min(at + AHEAD, drawn - 1)];
-        __builtin_prefetch(task.boxes + 4 * ahead), __builtin_prefetch(task.ids + ahead);
-        before(at, i, strips);
-        for (int64_t row = task.boxes[4 * i]; row <= task.boxes[4 * i + 1]; ++row, ++strips)
-            for (int64_t column = strips->from; column <= strips->to; ++column)
-                visit(task.ids[i], row * task.columns + column);
-    }
-}
-
-// Sorts places by the depth in their upper half, equal ones as they stand, by three digits of 11 bits, and leaves the
-// places.
-void sort_by_depth(int64_t* values, int64_t count) {
-    constexpr int DIGITS = 3, BITS = 11, VALUES = 1 << BITS;
-    std::vector<int64_t> other(count);
-    int32_t places[DIGITS][VALUES] = {};
-    const auto digit = [](int64_t value, int which) { return value >> (32 + BITS * which) & (VALUES - 1); };
-    for (int64_t i = 0; i < count; ++i)
-        for (int which = 0; which < DIGITS; ++which) ++places[which][digit(values[i], which)];
-    int64_t *from = values, *to = other.data();
-    for (int which = 0; which < DIGITS; ++which) {
-        if (places[which][digit(values[0], which)] == count) continue;  // all the same
-        int32_t sum = 0;
-        for (int32_t& place : places[which]) sum += std::exchange(place, sum);
-        for (int64_t i = 0; i < count; ++i) to[places[which][digit(from[i], which)]++] = from[i];
-        std::swap(from, to);
-    }
-    for (int64_t i = 0; i < count; ++i) values[i] = from[i] & 0xffffffff;
 }
 
 }  // namespace
 
 extern "C" {
 
-// Places all Gaussians: everything but the pairs.
 void pointsplat_place(const Placing* task, int64_t* next) {
     switch (task->degree) {
         case -1: return place_all<-1>(*task, next);
@@ -182,40 +94,6 @@ void pointsplat_place(const Placing* task, int64_t* next) {
         case 2: return place_all<2>(*task, next);
         case 3: return place_all<3>(*task, next);
     }
-}
-
-// Orders the Gaussians by depth, equal ones by row, writes their strips, and counts the pairs of each tile into ``offsets``,
-// from its second place on.
-void pointsplat_count_placed(const Placing* task) {
-    const int64_t ranges = (task->scene.count + RANGE - 1) / RANGE;
-    if (ranges == 0) return;  // no Gaussians
-    const double nearest = *std::min_element(task->nearest, task->nearest + ranges);
-    int64_t drawn = 0;
-    for (int64_t range = 0; range < ranges; ++range) {
-        for (int64_t i = range * RANGE; i < range * RANGE + task->counts[range]; ++i) {
-            const float beyond = static_cast<float>(task->depths[i] - nearest);  // not negative: ordered as its bits
-            int32_t bits;
-            std::memcpy(&bits, &beyond, sizeof(bits));
-            task->order[drawn++] = static_cast<int64_t>(bits) << 32 | i;
-        }
-    }
-    if (drawn == 0) return;
-    sort_by_depth(task->order, drawn);
-    const int64_t stride = GEOMETRY + (task->degree < 0 ? 0 : 3);
-    each_pair(
-        *task, drawn,
-        [&](int64_t at, int64_t i, Strip* strips) {
-            const int64_t ahead = task->order[std::min(at + AHEAD / 2, drawn - 1)];
-            __builtin_prefetch(task->table + stride * task->ids[ahead]);
-            write_strips(*task, i, strips);
-        },
-        [&](int64_t, int64_t tile) { ++task->offsets[tile + 1]; });
-}
-
-// Writes the Gaussians of each tile, front to back, from ``free``, [tiles], on.
-void pointsplat_list_placed(const Placing* task, int64_t drawn, int64_t* free) {
-    each_pair(
-        *task, drawn, [](int64_t, int64_t, Strip*) {}, [&](int64_t row, int64_t tile) { task->pairs[free[tile]++] = row; });
 }
 
 }  // extern "C"

@@ -8,7 +8,7 @@
 
 extern "C" {
 
-// A Gaussian that is drawn.
+// A Gaussian that is drawn; projection.py takes rows of it apart.
 struct Seen {
     double depth;
     int64_t id;
@@ -19,13 +19,8 @@ struct Seen {
 struct Projection {
     Camera camera;
     Scene scene;
-    Seen* seen;              // [N] each range's from where the range begins
-    int64_t* counts;         // [ranges] how many
-    double* nearest;         // [ranges] least depth
-    const int64_t* offsets;  // [ranges] where they begin in what follows, [M, ...] each
-    int64_t* ids;
-    float *means2d, *depths, *cov2d, *dets, *opacities, *directions, *depth_keys;
-    int32_t* radii;
+    Seen* seen;       // [N] each range's from where the range begins
+    int64_t* counts;  // [ranges] how many
 };
 
 struct ProjectionGradient {
@@ -174,27 +169,6 @@ void pointsplat_project(const Projection* task, int64_t* next) {
         Seen *begin = task->seen + first, *end = begin;
         for (int64_t at = 0; at < number; at += LANES) end = project_lanes(*task, Lanes(candidates + at, number - at), end);
         task->counts[range] = end - begin;
-        double nearest = std::numeric_limits<double>::infinity();
-        for (const Seen* seen = begin; seen < end; ++seen) nearest = std::min(nearest, seen->depth);
-        task->nearest[range] = nearest;
-    });
-}
-
-// Copies ``seen`` into the arrays of the output.
-void pointsplat_unpack(const Projection* task, int64_t* next) {
-    const Projection& t = *task;
-    const double nearest = *std::min_element(t.nearest, t.nearest + (t.scene.count + RANGE - 1) / RANGE);
-    each_range(next, t.scene.count, [&](int64_t range, int64_t first, int64_t) {
-        for (int64_t i = 0; i < t.counts[range]; ++i) {
-            const Seen& seen = t.seen[first + i];
-            const int64_t to = t.offsets[range] + i;
-            t.ids[to] = seen.id, t.radii[to] = seen.radius;
-            t.depths[to] = seen.z, t.depth_keys[to] = static_cast<float>(seen.depth - nearest);
-            t.dets[to] = seen.det, t.opacities[to] = seen.opacity;
-            std::copy_n(seen.mean2d, 2, t.means2d + 2 * to);
-            std::copy_n(seen.cov2d, 3, t.cov2d + 3 * to);
-            std::copy_n(seen.direction, 3, t.directions + 3 * to);
-        }
     });
 }
 

@@ -1,89 +1,94 @@
 // The tiles that each Gaussian touches, for float32 on a CPU.
 //
-// compiled/tiles.py calls this file where it was built; ellipses.py does the same in torch,
-// says where the formulas are from, and has the names that are used here.
+// compiled/tiles.py calls this file where it was built; ellipses.py does the same in torch. Gaussians are rows of the table
+// of pointsplat_tabulate. At an offset v across rows of pixels, the ellipse a w^2 + d v^2 = level within which one is drawn
+// reaches from r v - w to r v + w.
 
+#include <utility>
 #include <vector>
 
-#include "extent.h"
-
-namespace {
-
-constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
-
-}  // namespace
+#include "lanes.h"
 
 extern "C" {
 
-struct Grid {
-    int64_t height, rows, columns;  // pixels, tiles
-    float slack;
+// The columns of tiles that an ellipse touches in one row of tiles; none if the last is before the first.
+struct Strip {
+    int32_t from, to;
 };
 
-struct Ellipses {
-    const int64_t* order;  // [M]
-    float* shapes;         // [M, 7] in depth order, as all that follows
-    int64_t *row0, *row1, *column0, *widths;
-    int64_t count;  // M
-};
-
-struct Footprints {
-    Grid grid;
-    Ellipses ellipses;
-    const float *means2d, *cov2d, *det, *opacities;  // of the projected Gaussians, in their own order
-    float alpha_min;
-};
-
-void pointsplat_ellipses(const Footprints* task, int64_t* next) {
-    const Footprints& f = *task;
-    const Ellipses& e = f.ellipses;
-    const float slack = f.grid.slack;
-    each_range(next, e.count, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t at = first; at < last; ++at) {
-            const int64_t ahead = e.order[std::min(at + AHEAD, e.count - 1)], i = e.order[at];
-            __builtin_prefetch(f.means2d + 2 * ahead), __builtin_prefetch(f.cov2d + 3 * ahead);
-            __builtin_prefetch(f.det + ahead), __builtin_prefetch(f.opacities + ahead);
-            const float x = f.means2d[2 * i], y = f.means2d[2 * i + 1];
-            const float xx = f.cov2d[3 * i], xy = f.cov2d[3 * i + 1], yy = f.cov2d[3 * i + 2];
-            const float level = 2.0f * std::max(std::log(f.opacities[i] / f.alpha_min), 0.0f);
-            float* shape = e.shapes + 7 * at;
-            shape[0] = x, shape[1] = y, shape[2] = level, shape[3] = 1.0f / yy;
-            shape[4] = xy * std::sqrt(level / xx), shape[5] = xy / yy, shape[6] = f.det[i] / yy;
-            const float half_x = std::sqrt(level * xx) + slack, half_y = std::sqrt(level * yy) + slack;
-            e.row0[at] = tile_from(y - half_y, f.grid.rows), e.row1[at] = tile_to(y + half_y, f.grid.rows);
-            e.column0[at] = tile_from(x - half_x, f.grid.columns);
-            const int64_t width = tile_to(x + half_x, f.grid.columns) - e.column0[at] + 1;
-            e.widths[at] = std::max<int64_t>(width, 0);
-        }
-    });
-}
-
-// The pairs of a region, in three calls: strips, by threads; how many there are; and the pairs.
+// Gaussians, front to back, and the tiles that they touch in some rows of tiles.
 struct Listing {
-    Grid grid;
-    Ellipses ellipses;
-    int64_t top, bottom, left, right, tiles;  // the region, and its tiles
-    const int64_t* starts;                    // [M + 1] where each Gaussian's strips start
-    Strip* strips;                            // columns of the region
-    int64_t* counts;              // [M] pairs of each Gaussian
-    int64_t* offsets;             // [tiles + 1] counts, then where each tile's pairs start
-    int64_t *gaussians, *places;  // [P] by tile, front to back; and where each pair stands by Gaussian
+    const float* table;
+    int64_t stride;         // numbers in a row of the table
+    const int64_t* order;   // [M] rows, front to back
+    int64_t count;          // M
+    int32_t* boxes;         // [M, 4] in this order, first and last row of tiles, first and last column
+    int64_t height, rows, columns, top, bottom;  // of the image, pixels and tiles; rows of tiles from top on, before bottom
+    float log2_alpha_min, slack;
+    Strip* strips;                // one for each row of tiles of each Gaussian
+    int64_t* offsets;             // [tiles + 1] counts, in the next place, then where each tile's pairs start
+    int64_t* counts;              // [M] pairs of each Gaussian; or null
+    int64_t *gaussians, *places;  // [P] rows of the table by tile; where each pair stands by Gaussian, or null
 };
 
 }  // extern "C"
 
 namespace {
 
-inline int64_t first_row(const Listing& l, int64_t i) { return std::max(l.ellipses.row0[i], l.top); }
+constexpr int64_t AHEAD = 24;  // Gaussians between the one that is prefetched and the one that is read
 
-// Calls ``visit`` with each Gaussian and tile that touch, by Gaussian.
-template <typename Visit>
-void each_pair(const Listing& l, Visit visit) {
-    const int64_t columns = l.right - l.left;
-    for (int64_t i = 0; i < l.ellipses.count; ++i) {
-        int64_t base = (first_row(l, i) - l.top) * columns;
-        for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, base += columns)
-            for (int64_t tile = base + l.strips[at].from; tile <= base + l.strips[at].to; ++tile) visit(i, tile);
+// An ellipse, and how far it reaches down and across.
+struct Ellipse {
+    float x, y, r, a, d, level, down, across;
+
+    Ellipse(const float* row, float log2_alpha_min) : x(row[0]), y(row[1]), r(row[2]), a(row[3]), d(row[4]) {
+        level = 2.0f * std::max(row[5] - log2_alpha_min, 0.0f);
+        down = std::sqrt(level / d), across = std::sqrt(level / a + (r * down) * (r * down));
+    }
+};
+
+// Fetches the row of a Gaussian that is read soon.
+inline void fetch(const Listing& l, int64_t at) {
+    __builtin_prefetch(l.table + l.stride * l.order[std::min(at + AHEAD, l.count - 1)]);
+}
+
+inline Ellipse ellipse_of(const Listing& l, int64_t at) {
+    return Ellipse(l.table + l.stride * l.order[at], l.log2_alpha_min);
+}
+
+// Writes the strips of a Gaussian in rows of tiles ``top`` to ``bottom``.
+void write_strips(const Listing& l, int64_t at, int64_t top, int64_t bottom, Strip* strips) {
+    const int32_t* box = l.boxes + 4 * at;
+    if (box[2] == box[3] || box[0] == box[1]) {  // the ellipse touches all tiles of its box
+        std::fill(strips, strips + std::max<int64_t>(bottom - top + 1, 0), Strip{box[2], box[3]});
+        return;
+    }
+    const Ellipse e = ellipse_of(l, at);
+    const float widest = e.across > 0.0f ? e.r * e.down / e.across * e.down : 0.0f;
+    for (int64_t row = top; row <= bottom; ++row) {
+        const float first = row * TILE + (0.5f - l.slack) - e.y;
+        const float last = std::min(row * TILE + (TILE - 0.5f), l.height - 0.5f) + l.slack - e.y;
+        const auto edge = [&](float v, float sign) {  // at the v of the row that is nearest to where it is widest
+            v = std::min(std::max(v, first), last);
+            return e.x + e.r * v + sign * (std::sqrt(std::max(e.level - e.d * v * v, 0.0f) / e.a) + l.slack);
+        };
+        *strips++ = {static_cast<int32_t>(tile_from(edge(-widest, -1.0f), l.columns)),
+                     static_cast<int32_t>(tile_to(edge(widest, 1.0f), l.columns))};
+    }
+}
+
+// Calls ``visit`` with the place of each Gaussian in the order and each tile that its strips touch; ``before`` first, with
+// the place, its rows of tiles and its strips.
+template <typename Before, typename Visit>
+void each_pair(const Listing& l, Before before, Visit visit) {
+    Strip* strips = l.strips;
+    for (int64_t at = 0; at < l.count; ++at) {
+        const int32_t* box = l.boxes + 4 * at;
+        const int64_t top = std::max<int64_t>(box[0], l.top), bottom = std::min<int64_t>(box[1], l.bottom - 1);
+        before(at, top, bottom, strips);
+        for (int64_t row = top; row <= bottom; ++row, ++strips)
+            for (int64_t column = strips->from; column <= strips->to; ++column)
+                visit(at, (row - l.top) * l.columns + column);
     }
 }
 
@@ -91,42 +96,71 @@ void each_pair(const Listing& l, Visit visit) {
 
 extern "C" {
 
-void pointsplat_strips(const Listing* listing, int64_t* next) {
+// Writes the order of ``count`` depths, not negative, equal ones as they stand: sorted by three digits of 11 bits.
+void pointsplat_by_depth(const float* depths, int64_t count, int64_t* order) {
+    constexpr int DIGITS = 3, BITS = 11, VALUES = 1 << BITS;
+    std::vector<int64_t> values(count), other(count);  // bits of the depth, which are in its order, then the place
+    int32_t places[DIGITS][VALUES] = {};
+    const auto digit = [](int64_t value, int which) { return value >> (32 + BITS * which) & (VALUES - 1); };
+    for (int64_t i = 0; i < count; ++i) {
+        int32_t bits;
+        std::memcpy(&bits, depths + i, sizeof(bits));
+        values[i] = static_cast<int64_t>(bits) << 32 | i;
+        for (int which = 0; which < DIGITS; ++which) ++places[which][digit(values[i], which)];
+    }
+    for (int which = 0; which < DIGITS; ++which) {
+        int32_t sum = 0;
+        for (int32_t& place : places[which]) sum += std::exchange(place, sum);
+        for (int64_t value : values) other[places[which][digit(value, which)]++] = value;
+        values.swap(other);
+    }
+    for (int64_t i = 0; i < count; ++i) order[i] = values[i] & 0xffffffff;
+}
+
+// Writes boxes.
+void pointsplat_boxes(const Listing* listing, int64_t* next) {
     const Listing& l = *listing;
-    const float slack = l.grid.slack;
-    each_range(next, l.ellipses.count, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i) {
-            const float *s = l.ellipses.shapes + 7 * i, x = s[0], y = s[1], level = s[2], inverse_yy = s[3], peak = s[4];
-            int64_t row = first_row(l, i);
-            for (int64_t at = l.starts[i]; at < l.starts[i + 1]; ++at, ++row) {
-                const float top = row * TILE + (0.5f - slack) - y;
-                const float bottom = std::min(row * TILE + (TILE - 0.5f), l.grid.height - 0.5f) + slack - y;
-                const auto edge = [&](float dy, float sign) {
-                    dy = std::min(std::max(dy, top), bottom);
-                    const float within = std::max(level - dy * dy * inverse_yy, 0.0f);
-                    return x + s[5] * dy + sign * (std::sqrt(within * s[6]) + slack);
-                };
-                const int64_t from = std::max(tile_from(edge(-peak, -1.0f), l.grid.columns), l.left);
-                const int64_t to = std::min(tile_to(edge(peak, 1.0f), l.grid.columns), l.right - 1);
-                l.strips[at] = {static_cast<int32_t>(from - l.left), static_cast<int32_t>(to - l.left)};
-            }
+    each_range(next, l.count, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t at = first; at < last; ++at) {
+            fetch(l, at);
+            const Ellipse e = ellipse_of(l, at);
+            const float half_y = e.down + l.slack, half_x = e.across + l.slack;
+            int32_t* box = l.boxes + 4 * at;
+            box[0] = static_cast<int32_t>(tile_from(e.y - half_y, l.rows));
+            box[1] = static_cast<int32_t>(tile_to(e.y + half_y, l.rows));
+            box[2] = static_cast<int32_t>(tile_from(e.x - half_x, l.columns));
+            box[3] = static_cast<int32_t>(tile_to(e.x + half_x, l.columns));
         }
     });
 }
 
+// Writes strips, and counts the pairs.
 void pointsplat_count(const Listing* listing) {
     const Listing& l = *listing;
-    each_pair(l, [&](int64_t i, int64_t tile) { ++l.counts[i], ++l.offsets[tile + 1]; });
+    each_pair(
+        l,
+        [&](int64_t at, int64_t top, int64_t bottom, Strip* strips) {
+            fetch(l, at);
+            write_strips(l, at, top, bottom, strips);
+        },
+        [&](int64_t at, int64_t tile) {
+            ++l.offsets[tile + 1];
+            if (l.counts) ++l.counts[at];
+        });
 }
 
+// Writes the pairs.
 void pointsplat_list(const Listing* listing) {
     const Listing& l = *listing;
-    std::vector<int64_t> free(l.offsets, l.offsets + l.tiles);  // where the next pair of each tile goes
+    std::vector<int64_t> free(l.offsets, l.offsets + (l.bottom - l.top) * l.columns);  // where the next pair of each tile goes
     int64_t pair = 0;
-    each_pair(l, [&](int64_t i, int64_t tile) {
-        const int64_t place = free[tile]++;
-        l.gaussians[place] = l.ellipses.order[i], l.places[place] = pair++;
-    });
+    each_pair(
+        l, [](int64_t, int64_t, int64_t, Strip*) {},
+        [&](int64_t at, int64_t tile) {
+            const int64_t to = free[tile]++;
+            l.gaussians[to] = l.order[at];
+            if (l.places) l.places[to] = pair++;
+        });
 }
 
 }  // extern "C"

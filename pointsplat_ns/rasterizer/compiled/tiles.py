@@ -3,60 +3,69 @@
 
 from __future__ import annotations
 
+import math
+from typing import cast
+
 import torch
 from torch import Tensor
 
+from pointsplat_ns.rasterizer.compiled.blending import inputs_of
 from pointsplat_ns.rasterizer.constants import SLACK
-from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, Region, TileList
+from pointsplat_ns.rasterizer.ellipses import Ellipses, Grid, TileList
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import INDICES
 
 
-def _grid(grid: Grid) -> Struct:
-    return KERNELS.structs["Grid"](height=grid.height, rows=grid.rows, columns=grid.columns, slack=SLACK)
+def by_depth(depths: Tensor) -> Tensor:
+    """As :func:`pointsplat_ns.rasterizer.ellipses.by_depth`, of depths that are not negative."""
+    order = torch.empty(len(depths), **INDICES)
+    KERNELS.library.pointsplat_by_depth(depths, len(depths), order)
+    return order
 
 
-def _ellipses(ellipses: Ellipses) -> Struct:
-    return KERNELS.structs["Ellipses"](**ellipses._asdict(), count=len(ellipses.order))
-
-
-def ellipses_of(
-    means2d: Tensor,
-    cov2d: Tensor,
-    det: Tensor,
-    opacities: Tensor,
-    order: Tensor,
-    grid: Grid,
-    alpha_min: float,
-) -> Ellipses:
+def ellipses_of(means2d: Tensor, cov2d: Tensor, det: Tensor, opacities: Tensor, order: Tensor, grid: Grid) -> Ellipses:
     """As :func:`pointsplat_ns.rasterizer.ellipses.ellipses_of`."""
-    numbers = [torch.empty_like(order) for _ in range(4)]
-    found = Ellipses(order, means2d.new_empty(len(order), 7), *numbers)
-    task = KERNELS.structs["Footprints"](
-        grid=_grid(grid), ellipses=_ellipses(found), means2d=means2d.contiguous(), cov2d=cov2d.contiguous(),
-        det=det.contiguous(), opacities=opacities.contiguous(), alpha_min=alpha_min,
-    )  # fmt: skip
-    on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_ellipses, task)
+    return boxed(inputs_of(means2d, cov2d, det, opacities, means2d[:, :0], grid.alpha_min), order, grid)
+
+
+def boxed(table: Tensor, order: Tensor, grid: Grid) -> Ellipses:
+    """The ellipses of the Gaussians in some rows of a table, ``order``, (M,) int64, front to back."""
+    found = Ellipses(order, table, torch.empty(len(order), 4, dtype=torch.int32, device="cpu"))
+    on_threads(len(order) >= SEVERAL, KERNELS.library.pointsplat_boxes, _task(found, grid, 0, grid.rows))
     return found
 
 
-def pairs_of(ellipses: Ellipses, grid: Grid, region: Region) -> TileList:
-    """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
-    library, count = KERNELS.library, len(ellipses.order)
-    heights = ellipses.row1.clamp_max(region.bottom - 1).sub_(ellipses.row0.clamp_min(region.top)).add_(1).clamp_min_(0)
-    starts = torch.zeros(count + 1, **INDICES)
-    torch.cumsum(heights, 0, out=starts[1:])
-    strips, counts = torch.empty(int(starts[-1]), 2, dtype=torch.int32, device="cpu"), torch.zeros_like(ellipses.order)
-    tiles = region.rows * region.columns
-    offsets = torch.zeros(tiles + 1, **INDICES)
-    task = KERNELS.structs["Listing"](
-        grid=_grid(grid), ellipses=_ellipses(ellipses), **region._asdict(), tiles=tiles, starts=starts, strips=strips,
-        counts=counts, offsets=offsets,
+def _task(ellipses: Ellipses, grid: Grid, top: int, bottom: int, **lists: Tensor | None) -> Struct:
+    return KERNELS.structs["Listing"](
+        table=ellipses.shapes, stride=ellipses.shapes.shape[1], boxes=ellipses.boxes, order=ellipses.order,
+        count=len(ellipses.order), height=grid.height, rows=grid.rows, columns=grid.columns, top=top, bottom=bottom,
+        log2_alpha_min=math.log2(grid.alpha_min), slack=SLACK, **lists,
     )  # fmt: skip
-    on_threads(count >= SEVERAL, library.pointsplat_strips, task)
-    library.pointsplat_count(task)
+
+
+def listed(
+    ellipses: Ellipses, grid: Grid, top: int, bottom: int, counts: Tensor | None = None, most_pairs: float = math.inf
+) -> tuple[Tensor, Tensor, Tensor | None] | None:
+    """``gaussians`` and ``offsets`` of the :class:`TileList` of the rows of tiles from ``top`` to ``bottom`` - 1; its
+    ``places``, given ``counts`` (M,) of zeros, to which the pairs of each Gaussian are added; None if there are more
+    than ``most_pairs`` pairs."""
+    first, last = ellipses.boxes[:, 0].clamp_min(top), ellipses.boxes[:, 1].clamp_max(bottom - 1)
+    strips = torch.empty(int((last - first + 1).clamp_min_(0).sum()), 2, dtype=torch.int32, device="cpu")
+    offsets = torch.zeros((bottom - top) * grid.columns + 1, **INDICES)
+    task = _task(ellipses, grid, top, bottom, strips=strips, offsets=offsets, counts=counts)
+    KERNELS.library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
-    gaussians, places = (offsets.new_empty(int(offsets[-1])) for _ in range(2))
+    total = int(offsets[-1])
+    if total > most_pairs:
+        return None
+    gaussians, places = torch.empty(total, **INDICES), None if counts is None else torch.empty(total, **INDICES)
     task.fill(offsets=offsets, gaussians=gaussians, places=places)
-    library.pointsplat_list(task)
-    return TileList(gaussians, offsets, places, counts, ellipses.order, region)
+    KERNELS.library.pointsplat_list(task)
+    return gaussians, offsets, places
+
+
+def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
+    """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
+    counts = torch.zeros_like(ellipses.order)
+    gaussians, offsets, places = cast(tuple[Tensor, Tensor, Tensor], listed(ellipses, grid, top, bottom, counts))
+    return TileList(gaussians, offsets, places, counts, ellipses.order, top)

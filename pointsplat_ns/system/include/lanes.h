@@ -47,6 +47,18 @@ inline void each_bit(uint32_t bits, Work work) {
     for (; bits; bits &= bits - 1) work(__builtin_ctz(bits));
 }
 
+// First tile with a pixel centre at or after a position.
+inline int64_t tile_from(float position, int64_t tiles) {
+    const float tile = std::ceil((position - (TILE - 0.5f)) / TILE);
+    return static_cast<int64_t>(std::min(std::max(tile, 0.0f), static_cast<float>(tiles)));
+}
+
+// Last tile with a pixel centre at or before a position.
+inline int64_t tile_to(float position, int64_t tiles) {
+    const float tile = std::floor((position - 0.5f) / TILE);
+    return static_cast<int64_t>(std::min(std::max(tile, -1.0f), static_cast<float>(tiles - 1)));
+}
+
 inline Lane narrow(Wide x) { return __builtin_convertvector(x, Lane); }
 
 template <typename Function>
