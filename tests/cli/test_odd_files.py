@@ -44,7 +44,6 @@ def here(tmp_path, monkeypatch):
         ("run/config.yml", ("export", "run", "-o", "b.ply"), "expected a scene"),
         ("a.json", ("prune", *ROOM, "--poses", "a.json", "--keep", "auto"), "a.json: not a regular file"),
         ("model/cameras.bin", ("prune", *ROOM, "--poses", "model", "--keep", "auto"), "model: a folder without"),
-        ("a.json", ("render", "room.ply", "--path", "a.json"), "a.json: not a regular file"),
         ("a.safetensors", ("compact", *ROOM, "--refiner", "a.safetensors"), "a.safetensors: not a regular file"),
         ("out/pointsplat-scenes.json", ("compact", ".", "-o", "out"), "pointsplat-scenes.json: cannot be read ("),
         ("b.ply", ("prune", *ROOM, "-o", "b.ply", "--force"), "b.ply: not a regular file"),

@@ -34,6 +34,12 @@ def test_ssim_in_float32_is_that_of_float64_on_extreme_images():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
+def test_gradients_agree_with_float64_differences(metric):
+    a, b = pair(12, 13, dtype=torch.float64)
+    assert torch.autograd.gradcheck(metric, (a.requires_grad_(), b.requires_grad_()), fast_mode=True)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [
