@@ -164,10 +164,10 @@ def compact_source(
 
     dense, source, photos = _read_photographed(scene, looking, progress)
     with progress_bar(progress) as report:
-        if request.target_db is None:
-            result = compact_scene(dense, request, source, report, photos.training)
+        if request.searched:
+            result = compact_to_psnr(dense, request, source, report, *photos)
         else:
-            result = compact_to_psnr(dense, request, source, report)
+            result = compact_scene(dense, request, source, report, photos.training)
     _log_details((*result.notes, *result.verdict.splitlines()), source)
     log(tuple(filter(None, [result.target])))
     trained = next((place for place, stage in enumerate(result.stages) if stage.photos is not None), None)

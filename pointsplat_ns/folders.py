@@ -291,7 +291,7 @@ class _Compacting:
         prune = dataclasses.replace(self.request.prune, suffix=kind.suffix)
         trained = None if self.refiner is None else _loaded(self.refiner)
         request = dataclasses.replace(self.request, prune=prune, refiner=trained)
-        made = (compact_scene if request.target_db is None else compact_to_psnr)(dense, request, source)
+        made = (compact_to_psnr if request.searched else compact_scene)(dense, request, source)
         if made.interrupted:
             raise KeyboardInterrupt  # Ctrl-C ends the whole command, not the work on one scene
         scene = made.scene

@@ -91,8 +91,9 @@ def compact(
         goal: the purpose, in place of --keep and the format: web (a .sog of 2 MB, and a page with the scene to paste
             into another), phone (a .sog of at most 500,000 Gaussians), headset (an .spz of at most 400,000), email (an
             .spz of 5 MB, and a page that opens with a double click). --keep, --target-db and --html replace its parts.
-        keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. By
-            default the budget of the refiner's training; without a refiner 0.1.
+        keep: size of the result, as for prune: 0.1, 10%, 50000, 12MB, or auto:35, which is reached before repairs. With
+            --photos, auto is the smallest file that loses at most 0.3 dB in held-out photos. By default the budget of
+            the refiner's training; without a refiner 0.1.
         refiner: a trained network that refines the scene before the steps: a pointsplat run (its folder or config.yml),
             a .safetensors file, or shipped; by default none.
         by: the method of prune; by default the method of the refiner's training; without a refiner merge.

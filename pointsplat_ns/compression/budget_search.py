@@ -170,7 +170,12 @@ def _as_written(scene: Gaussians) -> Gaussians:
 
 
 def smallest_within(
-    n: int, measure: Callable[[int], tuple[float, Made]], psnr: float, stoppable: bool = False
+    n: int,
+    measure: Callable[[int], tuple[float, Made]],
+    psnr: float,
+    stoppable: bool = False,
+    first: float = 0.3,
+    slope: float = SLOPE,
 ) -> tuple[Made, Found[Made]]:
     """Search for the smallest scene of a method that reaches ``psnr``, dB. A smaller such scene may exist where PSNR
     does not always rise with the count.
@@ -179,7 +184,8 @@ def smallest_within(
         n: number of Gaussians of the dense scene.
         measure: from a count, at most n, to the PSNR of a scene against the dense one, dB, and what was made.
         psnr: to be reached, dB, above 0.
-        stoppable: as for :func:`find_count`.
+        stoppable, slope: as for :func:`find_count`.
+        first: share of n that is tried first.
 
     Returns:
         What was made with the best count, and the search.
@@ -187,10 +193,9 @@ def smallest_within(
     Raises:
         BudgetError: if not even n Gaussians reach it.
     """
-    first = max(1, round(0.3 * n))
-    found = find_count(measure, psnr, True, first, n, SLOPE, tolerance=0.1, stoppable=stoppable)
+    found = find_count(measure, psnr, True, max(1, round(first * n)), n, slope, tolerance=0.1, stoppable=stoppable)
     if found.best is None:
-        raise BudgetError(f"all {n} Gaussians reach {found.tried[n]:.1f} dB, not {psnr:g} dB; ask for less")
+        raise BudgetError(f"all {n} Gaussians reach {found.tried[n]:.1f} dB, not {psnr:.4g} dB; ask for less")
     return found.best, found
 
 

@@ -1,5 +1,5 @@
 """Compacts a scene in stages: prune, refine, repair, and round for a file of limited size. Refinement and repair are
-accepted by comparing renders with those of the dense scene. For a PSNR after all stages, counts are searched."""
+accepted by comparing renders with those of the dense scene. For a quality after all stages, counts are searched."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget, default_device
+from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -25,8 +25,9 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.photos.examples import Photos
+from pointsplat_ns.photos.examples import Photos, mean_psnr
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.quantities import counted
 
 
 def compact_scene(
@@ -53,7 +54,7 @@ def compact_scene(
     request.check_sh_degree(dense)
     views = views or ViewSource(dense)
     pruned = prune_scene(dense, request.prune, views, progress, rounding=False)
-    at_work = dense.to(default_device() if request.refiner is None else request.refiner.device)
+    at_work = dense.to(request.device)
     judge, reference, uncompared = None, None, ""
     try:
         progress("comparing renders", 0.0)
@@ -137,38 +138,56 @@ def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | No
 
 
 def compact_to_psnr(
-    dense: Gaussians, request: CompactRequest, views: ViewSource, progress: Progress = silent
+    dense: Gaussians,
+    request: CompactRequest,
+    views: ViewSource,
+    progress: Progress = silent,
+    photos: Photos | None = None,
+    held_out: Photos = (),
 ) -> Compacted:
-    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of
-    the request, in place of its budget.
+    """:func:`compact_scene` with the fewest Gaussians that reach ``target_db`` of the request, or lose at most
+    ``most_lost`` in the held-out photos, in place of its budget.
 
-    Each count is judged as every command judges (:mod:`~pointsplat_ns.compression.quality`), after writing and reading
-    the scene in the format of the request. Ctrl-C ends the search with the smallest scene found so far, if any.
+    Each count is judged after writing and reading the scene in the format of the request: as every command judges
+    (:mod:`~pointsplat_ns.compression.quality`), or in the photos. Ctrl-C ends the search with the smallest scene found
+    so far, if any.
 
     Raises:
         BudgetError: if not even all Gaussians reach it.
         SceneError, PointSplatError: as :func:`compact_scene`.
-        DataError: if there are no views.
+        DataError: if there are no views, or no held-out photos where these judge.
     """
-    assert request.target_db is not None
     start, suffix, numbers = time.perf_counter(), request.prune.suffix, itertools.count(1)
-    judge, kind = Judge(dense, views), format_to_write(suffix)
+    judge, kind, device = Judge(dense, views), format_to_write(suffix), request.device
+    every, known = [*range(len(held_out))], 0.0
+    if request.most_lost is not None:
+        if not every:
+            raise DataError("there are no held-out photos, in which --keep auto judges; expected a budget, such as 10%")
+        known = mean_psnr(dense.to(device), held_out, every)
 
     def measure(count: int) -> tuple[float, Compacted]:
         size = f"size {next(numbers)}"
         asked = replace(request, prune=replace(request.prune, keep=count))
-        made = compact_scene(dense, asked, views, lambda what, share: progress(f"{size}: {what}", share))
+        made = compact_scene(dense, asked, views, lambda what, share: progress(f"{size}: {what}", share), photos)
         if made.interrupted:
             raise KeyboardInterrupt
         if kind.rounded is not None and (psnr := judge.psnr(made.scene)[0]) <= ROUNDING.best_psnr:
             limit = FileLimit(kind, math.inf, rounding_for(psnr, made.scene.sh_degree))
             made = replace(made, stages=(*made.stages, *rounding_stage(made.last, limit, made.reference)))
         written_bytes, written = through_file(made.scene, suffix)
-        psnr, _ = judge.psnr(written)
-        reached = f"{decibels(psnr)} against the dense scene in {judge.where}"
+        if request.most_lost is None:
+            psnr, _ = judge.psnr(written)
+            reached = f"{decibels(psnr)} against the dense scene in {judge.where}"
+        else:
+            psnr = mean_psnr(written.to(device), held_out, every)
+            reached = f"{psnr:.1f} dB in {counted(len(every), 'held-out photo')}, the dense scene {known:.1f} dB"
         return psnr, replace(made, target=f"{reached}, {bytes_text(written_bytes)}, {len(made.scene):,} Gaussians")
 
-    best, found = smallest_within(len(dense), measure, request.target_db, stoppable=True)
+    if request.target_db is not None:
+        best, found = smallest_within(len(dense), measure, request.target_db, stoppable=True)
+    else:  # a tenth loses about 0.8 dB after training on photos, 30 % nothing
+        least = known - (request.most_lost or 0.0)
+        best, found = smallest_within(len(dense), measure, least, stoppable=True, first=0.15, slope=0.8)
     target = f"{best.target}; {len(found.tried)} sizes tried" + (", interrupted" if found.interrupted else "")
     seconds = time.perf_counter() - start
     return replace(best, target=target, judge=judge, interrupted=found.interrupted, seconds=seconds)

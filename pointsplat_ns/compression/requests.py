@@ -154,6 +154,8 @@ class CompactRequest:
     """Length of the optimisation against photos; None for none."""
     target_db: float | None = None
     """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None for none."""
+    most_lost: float | None = None
+    """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; None for none."""
 
     @classmethod
     def of(
@@ -170,7 +172,8 @@ class CompactRequest:
     ) -> CompactRequest:
         """A request from options that may be missing: ``keep`` and ``by`` are then those of the refiner's training;
         without a refiner, a tenth and merging. With ``photos``, a number of seconds is for the steps on
-        photos, and the repair is quick. Errors are those of :class:`PruneRequest`, or a BudgetError if the target is
+        photos, the repair is quick, and ``keep="auto"`` is the smallest file that loses at most 0.3 dB in held-out
+        photos. Errors are those of :class:`PruneRequest`, or a BudgetError if the target is
         not a positive number, or given with a budget or photos."""
         if target_db is not None and not 0 < target_db < math.inf:
             raise BudgetError(f"--target-db is {target_db:g}; expected a positive number, such as 32")
@@ -179,12 +182,25 @@ class CompactRequest:
             raise BudgetError(f"--target-db finds a size by renders of the dense scene; expected it without {other}")
         usual = PruneSettings(0.1, "merge") if refiner is None else refiner.settings
         by = usual.by if by is None else by
+        most_lost = 0.3 if photos and keep == "auto" else None
+        keep = None if most_lost else keep
         weight = usual.opacity_weight if method_named(by).weighs_opacity else None
         prune = PruneRequest(usual.keep if keep is None else keep, by, sh, weight, clean, suffix)
         if not photos:
             return cls(prune, refiner, repair, target_db=target_db)
         trained = PhotoBudget(repair.effort, repair.seconds)
-        return cls(prune, refiner, repair if repair.seconds is None else RepairBudget(), trained)
+        repair = repair if repair.seconds is None else RepairBudget()
+        return cls(prune, refiner, repair, trained, most_lost=most_lost)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that renders: the refiner's, or the default one."""
+        return default_device() if self.refiner is None else self.refiner.device
+
+    @property
+    def searched(self) -> bool:
+        """Whether the count is searched for that reaches a quality after all stages."""
+        return self.target_db is not None or self.most_lost is not None
 
     def check_sh_degree(self, dense: Gaussians) -> None:
         """Raise a SceneError, before the long computations, if the SH degree after pruning is certain to exceed the

@@ -10,15 +10,16 @@ import torch
 import pointsplat_ns as ps
 from making import FewViews, views_from_within
 from pointsplat_ns.compression import photo_repair as module
-from pointsplat_ns.compression.compact import compact_scene
+from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, gradients_of, size_factors
 from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
-from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest
+from pointsplat_ns.compression.quality import through_file
+from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest, RepairBudget
 from pointsplat_ns.errors import BudgetError, DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.photos import examples
-from pointsplat_ns.photos.examples import every_kth_pixel
+from pointsplat_ns.photos.examples import every_kth_pixel, mean_psnr
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import EPS2D
@@ -72,6 +73,19 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(faster, un
     stage, kept = result.stages[-1], text.startswith("trained")
     assert stage.name == "photos" and stage.accepted == kept and text in result.verdict
     assert result.scene is result.stages[-1 if kept else 0].scene and result.verdict.startswith("not") != kept
+
+
+def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollow_ball, photos):
+    request = CompactRequest.of(keep="auto", photos=True, suffix=".sog", repair=RepairBudget("quick"))
+    request = dataclasses.replace(request, most_lost=-2.0, repair=RepairBudget("instant"))  # gains 2 dB by the photos
+    training, held_out = photos[1:], photos[::8]
+    found = compact_to_psnr(hollow_ball, request, FewViews(hollow_ball), photos=training, held_out=held_out)
+    every = [0, 1, 2]
+    gained = mean_psnr(through_file(found.scene, ".sog")[1], held_out, every) - mean_psnr(hollow_ball, held_out, every)
+    assert 2.0 <= gained < 3.0 and len(found.scene) < 0.7 * len(hollow_ball)
+    assert "in 3 held-out photos, the dense scene" in found.target and "sizes tried" in found.target
+    with pytest.raises(DataError, match="there are no held-out photos"):
+        compact_to_psnr(hollow_ball, request, FewViews(hollow_ball), photos=training)
 
 
 def test_ctrl_c_gives_the_scene_so_far(hollow_ball, pruned, photos):
