@@ -48,7 +48,7 @@ PAGE = """# What smaller scenes lose
 
 - Splats are judged in at most {views} views of a camera path, captures in the poses of at most {views} held-out photos
   and at their size. Every way gets the PLY alone: no photos and no poses.
-- PSNR is in dB, over the pixels that the dense scene covers, against its renders where nothing else is said.
+- PSNR is in dB, over the pixels that the dense scene covers, by default against its renders.
 - {peer} stands for the best of its modes in each cell: {modes}.
 - Figures are means over scenes; leads have the smallest and its scene in brackets.
 """

@@ -3,7 +3,7 @@
     python -m lab.tables.networks outputs -o networks --held-out room35 phone
     python -m lab.tables RUN_OF_ROOM35 RUN_OF_PHONE -o tables --refiners networks
 
-The same command resumes: finished networks are left alone, an interrupted one goes on from its last step.
+The same command resumes: finished networks are left alone, an interrupted one resumes from its last step.
 """
 
 from __future__ import annotations

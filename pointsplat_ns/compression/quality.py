@@ -41,7 +41,7 @@ WORDS = (
 statues, a robot and stones at 50, 30, 10 and 3 % of their Gaussians."""
 
 MOST_SAID = 60.0
-"""PSNR that is said as a bound, dB: the rounding of pictures to 256 levels has 59."""
+"""PSNR from which on the text gives a bound, dB: the rounding of pictures to 256 levels has 59."""
 
 
 @dataclass(frozen=True)

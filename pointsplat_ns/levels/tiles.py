@@ -89,7 +89,7 @@ def write_tiles(
     """
     warn_of_losses(format_to_write(".spz"), levels[0], folder)
     tops = cells(levels, parents, most)
-    # CesiumJS refines a tile at an error of 16 pixels, unless it is told another number
+    # CesiumJS refines a tile at an error of 16 pixels, by default
     errors = [16.0 * size for size in itertools.accumulate(pixel_sizes, max)]
     counts, number = [0] * len(levels), itertools.count()
 

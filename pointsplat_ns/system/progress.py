@@ -68,7 +68,7 @@ def _lines(stream: IO[str]) -> Progress:
         written, gained, left = now, share - before, ""
         if gained > 0 and share < 1:
             left = f", about {_clock((now - start_of_task) * (1 - share) / gained)} left"
-        with suppress(OSError, ValueError):  # nobody reads any more: the work goes on
+        with suppress(OSError, ValueError):  # nobody reads any more: the work continues
             print(f"[{_clock(now - start)}] {what}: {100 * share:.0f} %{left}", file=stream, flush=True)
 
     return show

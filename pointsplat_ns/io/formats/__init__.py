@@ -161,11 +161,11 @@ def _told_by_zip(path: Path) -> Format | None:
             return None
         raise SceneError(f"{path}: a zip archive that is truncated or damaged ({one_line(error)})") from error
     files = [name.rpartition("/")[2].lower() for name in names]
-    told = next((kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None)
-    if told is None:
+    packed = next((kind for kind in FORMATS if kind.holds and fnmatch.filter(files, kind.holds)), None)
+    if packed is None:
         found = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         raise SceneError(f"{path}: a zip archive of {found or 'nothing'}; expected a SOG or a checkpoint")
-    return told
+    return packed
 
 
 def format_to_write(path: Path | str) -> Format:
