@@ -36,20 +36,14 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
     return splats(means, scales, torch.tensor(logits)[:, None], colours, quats)
 
 
-def cost_along_z(scene: Gaussians) -> float:
-    """The cost of merging the first of two Gaussians with the second, along the z axis."""
-    direction = int(DIRECTIONS[:, 2].abs().argmax())
-    assert float(DIRECTIONS[direction, 2].abs()) == 1.0
-    plane, i, j = torch.tensor([direction]), torch.tensor([0]), torch.tensor([[1]])
-    return float(costs_in_plane(state_of(scene), i, j, plane, MERGING, torch.float32))
-
-
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
 def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     """Against a sum over a fine grid in the plane, in float64."""
     scene = disks(logits=logits)
     state = state_of(scene)
-    got = cost_along_z(scene)
+    direction = int(DIRECTIONS[:, 2].abs().argmax())  # the z axis
+    first, second, plane = torch.tensor([0]), torch.tensor([[1]]), torch.tensor([direction])
+    got = float(costs_in_plane(state, first, second, plane, MERGING, torch.float32))
     axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
     cov = algebra.unpack(state.cov.double())[:, :2, :2]
