@@ -166,6 +166,24 @@ def test_no_overlap_exceeds_the_smaller_area(length, width):
     assert (found <= (1 + 1e-6) * torch.minimum(projected_area(flat), projected_area(0.5 * flat))).all()
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "apart"),
+    [((4.0, 0.0, 4.0), (4.0, 0.0, 4.0), (3.0, 1.0)), ((3.0, 1.2, 2.0), (1.0, -0.5, 2.5), (0.9, -1.4))],
+)
+def test_the_overlap_is_the_integral_of_the_product(first, second, apart):
+    axis = torch.linspace(-24, 24, 961, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
+    first, second, apart = (torch.tensor(values, dtype=torch.float64) for values in (first, second, apart))
+
+    def splat(flat: torch.Tensor, at: torch.Tensor | float) -> torch.Tensor:
+        inverse = torch.linalg.inv(flat[[0, 1, 1, 2]].view(2, 2))
+        return torch.exp(-0.5 * ((grid - at) @ inverse * (grid - at)).sum(-1))
+
+    integral = float((splat(first, 0.0) * splat(second, apart)).sum()) * 0.05**2 / (2 * math.pi)
+    u, v = apart[:, None]
+    assert overlap(first[None], second[None], u, v).item() == pytest.approx(integral, rel=1e-9)
+
+
 @needs_compiler
 def test_covariances_by_the_kernel_are_those_of_torch_also_at_the_extremes():
     g = torch.Generator().manual_seed(5)
