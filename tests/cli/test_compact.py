@@ -55,7 +55,8 @@ def test_refinement_that_helps_is_written_and_shown(ply, helps, tmp_path, capsys
     said = capsys.readouterr().out
     assert re.search(r"small.ply: pruned by opacity and refined to 75 of 150 Gaussians \(50 %\), .* kB, in .* s", said)
     lines = said.splitlines()
-    found = re.match(r"refined by the network: ([\d.]+) -> ([\d.]+) dB PSNR .* \(12 views", lines[1])
+    figures = r"([\d.]+) -> ([\d.]+) dB PSNR .* \(12 views of .*; worst .* dB, better in \d+"
+    found = re.match(f"refined by the network: {figures}", lines[1])
     assert float(found[2]) > float(found[1])
     assert lines[0].startswith("views: sampled poses, up is ") and "small.ply: " in lines[2]
     assert "shown.png: dense, pruned, refined, side by side" in said

@@ -31,18 +31,12 @@ def ply(tmp_path) -> Path:
     return tmp_path / "scene.ply"
 
 
-@pytest.fixture(scope="module")
-def refined_run(make_refined_run, trained_walls, tmp_path_factory) -> Path:
-    return make_refined_run(tmp_path_factory.mktemp("refined"), trained_walls, ("wall-b",), moved=0.5)
-
-
-def test_prune_refuses_what_is_no_scene(ply, refined_run, tmp_path, capsys):
+def test_prune_refuses_what_is_no_scene(ply, tmp_path, capsys):
     half = tmp_path / "half.ply"
     half.write_bytes(ply.read_bytes()[:-100])
     write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
     for words, said in (
         ([tmp_path / "gone.ply"], "gone.ply: no such file"),
-        ([refined_run], "another method"),
         ([half], "half.ply"),
         ([tmp_path / "nothing.ply"], "holds no Gaussians"),
         ([ply, "--by", "paper", "--opacity-weight", 2], "opacity_weight is 2.0; expected 0 to 1"),

@@ -4,16 +4,14 @@ import dataclasses
 
 import pytest
 
-from making import ball, box_room, same
+from making import ball, same
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.prune import Pruned, prune_scene
 from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.upright import up_named
 from pointsplat_ns.looking.view_source import ViewSource
-from pointsplat_ns.merging import MERGING
 from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.views import Views
@@ -65,13 +63,3 @@ def test_auto_sh_keeps_bands_that_are_seen_and_drops_those_that_are_not(scene, v
     result = pruned(strong, views, 1.0, "paper", sh="auto")
     assert result.scene.sh_degree == 1
     assert result.notes == ("views: given views", "SH degree 1 kept")
-
-
-def test_merging_stands_upright_in_views_that_are_sampled_for_it():
-    scene = box_room(0, 3000)
-    source = ViewSource(scene, resolution=(64, 48), up=up_named("x"))
-    looked = source.for_merging().views(MERGING.sampled_views, MERGING.view_seed)
-    assert (looked.width, looked.height) == (64, 48)
-    steep = (looked.viewmats[:, 2, :3] @ source.sampler.up.direction).abs() > 0.99  # level has no meaning there
-    level = looked.viewmats[~steep, 0, :3] @ source.sampler.up.direction  # no camera is rolled about its axis
-    assert int(steep.sum()) <= 6 and float(level.abs().max()) < 1e-6

@@ -7,20 +7,11 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from making import normal_scene
+from making import normal_scene, small_refiner
 from pointsplat_ns.compression.trained_refiner import load_refiner, open_refiner_run, scenes_of_run
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.pruning import PruneSettings, prune
-from pointsplat_ns.refiner import Refiner, WeightsError, preset, save_refiner
-
-
-def network(head: str = "scales", moved: float = 0.2) -> Refiner:
-    """An untrained refiner whose residual is ``moved`` for every value of one attribute, zero for the others."""
-    torch.manual_seed(1)
-    refiner = Refiner(preset("tiny"))
-    with torch.no_grad():
-        [*refiner.heads.mlps[head].modules()][-1].bias.fill_(moved)
-    return refiner
+from pointsplat_ns.refiner import WeightsError, save_refiner
 
 
 @pytest.mark.parametrize(
@@ -34,7 +25,7 @@ def network(head: str = "scales", moved: float = 0.2) -> Refiner:
     ],
 )
 def test_a_file_of_weights_says_what_it_was_trained_with(metadata, settings, tmp_path):
-    save_refiner(network(), tmp_path / "r.safetensors", metadata)
+    save_refiner(small_refiner(), tmp_path / "r.safetensors", metadata)
     loaded = load_refiner(tmp_path / "r.safetensors")
     assert loaded.settings == settings
     assert loaded.source == tmp_path / "r.safetensors"
@@ -46,7 +37,7 @@ def test_a_file_of_weights_says_what_it_was_trained_with(metadata, settings, tmp
     [{"keep": 1.5}, {"keep": 10**400}, {"by": "best"}, {"opacity_weight": []}, {"opacity_weight": -(10**400)}],
 )
 def test_metadata_that_make_no_sense_are_refused_in_one_line(metadata, tmp_path):
-    save_refiner(network(), tmp_path / "r.safetensors", metadata)
+    save_refiner(small_refiner(), tmp_path / "r.safetensors", metadata)
     with pytest.raises(WeightsError, match="r.safetensors: metadata not understood") as caught:
         load_refiner(tmp_path / "r.safetensors")
     assert "\n" not in str(caught.value)
@@ -101,12 +92,10 @@ def test_the_refiner_alone_needs_no_scenes(make_refined_run, tmp_path):
         open_refiner_run(run, need_data=True)
 
 
-def test_runs_of_another_method_are_refused(trained_walls, tmp_path):
+def test_runs_of_another_method_are_refused(trained_walls):
     (splatfacto,) = (trained_walls / "wall-a" / "splatfacto-cpu").iterdir()
     with pytest.raises(SceneError, match="a run of the method splatfacto-cpu; expected a pointsplat run"):
         load_refiner(splatfacto)
-    with pytest.raises(SceneError, match="no such file or folder"):
-        load_refiner(tmp_path / "nothing")
 
 
 @pytest.mark.parametrize(

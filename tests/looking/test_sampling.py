@@ -38,14 +38,17 @@ def test_sampled_poses_are_rotations_and_show_the_scene(hollow_ball):
 
 @pytest.mark.parametrize(
     "name, value",
-    [("scales", 1e4), ("scales", -1e4), ("opacities", 1e4), ("opacities", -1e4), ("quats", 0.0), ("quats", 3e38),
-     ("means", 3e38), ("means", 1e-40), ("features_dc", 3e38), ("features_rest", 3e38)],
+    [*(("scales", value) for value in (-1e4, -80.0, 80.0, 1e4)), ("opacities", 1e4), ("opacities", -1e4),
+     ("quats", 0.0), ("quats", 3e38), ("means", 3e38), ("means", 1e-40), ("features_dc", 3e38),
+     ("features_rest", 3e38)],
 )  # fmt: skip
-def test_a_few_extreme_gaussians_leave_views_that_are_finite(hollow_ball, name, value):
+def test_some_extreme_gaussians_leave_views_and_likelihoods_that_are_finite(hollow_ball, name, value):
     scene = hollow_ball.map(lambda tensor: tensor.clone())
-    getattr(scene, name)[::20] = value
-    views = sample_views(scene, 2, 48, 36)
+    getattr(scene, name)[:: 2 if name == "scales" else 20] = value
+    sampler = Sampler(scene, (48, 36))
+    views = sampler.views(2)
     assert len(views) == 2 and bool(views.viewmats.isfinite().all())
+    assert bool(sampler.judged(views_in_units(views, *sampler.content))[0].isfinite().all())
 
 
 def test_a_scene_that_shows_nothing_has_no_poses(hollow_ball):
@@ -110,7 +113,7 @@ def test_up_can_be_given():
             sample_views(scene, 4, up=wrong)
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
 @pytest.mark.parametrize("make", [room, tower])
 def test_views_do_not_depend_on_the_unit_of_length(make, factor):
     scene = make()
@@ -183,14 +186,3 @@ def test_the_next_view_shows_what_earlier_ones_do_not():
     found = sampler_of(wall(300)).completing
     assert found(likelihoods, shown, 4) == found(likelihoods, shown, 9) == [0, 2, 1, 3]
     assert found(likelihoods, shown, 0) == []
-
-
-@pytest.mark.parametrize("size", [-1e4, -80.0, 80.0, 1e4])
-def test_gaussians_of_any_size_have_views_of_finite_likelihood(size):
-    scene = wall(400)
-    scales = scene.scales.clone()
-    scales[::2] = size
-    sampler = sampler_of(scene.replace(scales=scales))
-    views = sampler.views(5)
-    assert bool(views.viewmats.isfinite().all())
-    assert bool(sampler.judged(views_in_units(views, *sampler.content))[0].isfinite().all())

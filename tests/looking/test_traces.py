@@ -15,7 +15,7 @@ from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoTraces, correlation, trace_factors
 from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.rasterizer.spherical_harmonics import sh_basis
+from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.views import Views
 
 
@@ -30,17 +30,8 @@ def test_places_of_photos_are_found():
     assert float((shares * opposite).sum()) > 4.0
 
 
-def sized_by_distance_from(eye: torch.Tensor, degree: int = 0) -> Gaussians:
-    """A full ball whose Gaussians are the larger the farther they are from an eye (3,)."""
-    generator = torch.manual_seed(2)
-    shell = ball(3000, degree, opacity=5.0)
-    means = shell.means * torch.rand(3000, 1, generator=generator) ** (1 / 3)
-    scales = (0.08 * (means - eye).norm(dim=1, keepdim=True)).log() + 0.1 * torch.randn(3000, 3, generator=generator)
-    return shell.replace(means=means, scales=scales, features_rest=torch.zeros_like(shell.features_rest))
-
-
 def test_infinite_sizes_and_gaussians_at_one_position_break_nothing():
-    scene = sized_by_distance_from(torch.tensor([0.7, 0.2, 0.0]))
+    scene = ball(3000, 0, opacity=5.0)
     scales = scene.scales.clone()
     scales[::7, 0] = -math.inf
     scales[::11] = -math.inf
@@ -105,16 +96,12 @@ def flattened(scene: Gaussians) -> Gaussians:
     return scene.replace(scales=scales)
 
 
-def without_sh(scene: Gaussians) -> Gaussians:
-    return scene.replace(features_rest=scene.features_rest[:, :0])
-
-
 @pytest.mark.parametrize(
     ("scene", "ratio", "tolerance"),
     [
         pytest.param(halves(2.0), 2**1.5, 0.05, id="SH energy to the power 3/4"),
         pytest.param(flattened(halves(1.0)), 3, 0.1, id="flatness"),
-        pytest.param(without_sh(flattened(halves(1.0))), 9, 0.2, id="flatness squared without SH"),
+        pytest.param(cut_sh(flattened(halves(1.0)), 0), 9, 0.2, id="flatness squared without SH"),
     ],
 )
 def test_trace_factors_grow_with(scene, ratio, tolerance):
@@ -142,11 +129,8 @@ def test_extremes_stay_within_bounds(dtype):
 
 def test_views_are_sampled_where_photos_were_taken():
     """A smooth shell around photos that were all taken from about one place."""
-    shell = ball(3000, 3, log_size=math.log(0.12), opacity=5.0)
-    eye = torch.tensor([0.6, 0.0, 0.0])
-    directions = torch.nn.functional.normalize(shell.means - eye, dim=1)
-    steps = 0.1 * torch.randn(3000, 3, generator=torch.manual_seed(1))
-    scene = shell.replace(features_rest=steps[:, None] * sh_basis(directions, 3)[:, 1:, None])
+    eye, shape = torch.tensor([0.6, 0.0, 0.0]), {"opacities": torch.full((3000, 1), 5.0)}
+    scene, shell = (some.replace(**shape) for some in (photographed(3000, eyes=eye[None]), ball(3000, 3)))
     assert PhotoTraces(scene).sure
     away = []
     for views in (sample_views(scene, 4, 64, 48), sample_views(shell, 4, 64, 48)):

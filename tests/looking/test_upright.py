@@ -52,18 +52,16 @@ def test_a_scene_with_positions_and_sizes_at_their_extremes_has_an_up(size):
 def statue() -> Gaussians:
     """A figure of 1 x 2.4 units on a block; its face, at x = 0.05, has many more Gaussians than its back."""
     fine = plates(((0.05, 0, 2.2), (0, 0.5, 1.2)), density=300)
-    fine = fine.replace(scales=fine.scales - 0.7)
     block = [((0, 0, z), (0.5, 0.5, 0)) for z in (0.8, 0.9, 1.0)]
     coarse = plates(((-0.05, 0, 2.2), (0, 0.5, 1.2)), *block, density=60)
-    return Gaussians(*(torch.cat(both) for both in zip(fine.tensors(), coarse.tensors(), strict=True)))
+    return Gaussians.cat([fine.replace(scales=fine.scales - 0.7), coarse])
 
 
 def corner() -> Gaussians:
     """Two walls, a floor, and a table of which photos showed the top."""
     table = plates(((0.3, 0.3, 0.9), (0.8, 0.8, 0)), density=300)
     walls = plates(((-2, 0, 1.2), (0, 2, 1.2)), ((0, -2, 1.2), (2, 0, 1.2)), ((0, 0, 0), (2, 2, 0)), density=40)
-    walls = walls.replace(scales=walls.scales + torch.tensor([0.5, 0.5, 0.5]))
-    return Gaussians(*(torch.cat(both) for both in zip(table.tensors(), walls.tensors(), strict=True)))
+    return Gaussians.cat([table, walls.replace(scales=walls.scales + 0.5)])
 
 
 @pytest.mark.parametrize(("width", "height"), [(960, 600), (400, 500)])

@@ -7,14 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, cloud, same, splats
+from making import ball, cloud, same, splats, views_from_within
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.merging import MERGING, Merged, Merger, merge, merge_levels
+from pointsplat_ns.merging import MERGING, Merger, merge, merge_levels
 from pointsplat_ns.merging.groups import deepened
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.kernels import Kernels
-from pointsplat_ns.views import Views
 
 RENDERED = replace(MERGING, min_count_rendered=0, sampled_views=8)
 """Settings with which the smallest scenes are rendered."""
@@ -31,23 +30,10 @@ def wall(side: int = 40, seed: int = 0) -> Gaussians:
     return splats(means, [math.log(2 / side), math.log(2 / side), -7.0], 1.5, colours)
 
 
-def one_view(back: float = 0.0) -> Views:
-    """A view from the origin, or from behind it."""
-    viewmats = torch.eye(4)[None].clone()
-    viewmats[0, 2, 3] = back
-    K = torch.tensor([[32.0, 0, 32], [0, 32.0, 32], [0, 0, 1.0]])
-    return Views(viewmats, K[None], 64, 64, torch.zeros(3))
-
-
-def sizes_of(merged: Merged) -> torch.Tensor:
-    """Number of Gaussians that each of the merged stands for, (K,)."""
-    return torch.bincount(merged.assignment[merged.assignment >= 0], minlength=len(merged.scene))
-
-
 def test_what_is_merged_with_nothing_is_unchanged_to_the_bit():
     scene = cloud(200)
     merged = merge(scene, 150)
-    single = (sizes_of(merged) == 1).nonzero()[:, 0]
+    single = (merged.assignment.bincount() == 1).nonzero()[:, 0]
     assert len(single) > 50
     where = torch.stack([(merged.assignment == index).nonzero()[0, 0] for index in single])
     assert same(merged.scene[single], scene[where])
@@ -114,7 +100,7 @@ def extreme_scenes() -> dict[str, Gaussians]:
 def test_extremes_give_k_drawable_gaussians(name, k):
     """Without views, and with one that shows some of it."""
     scene = extreme_scenes()[name]
-    merged = merge(scene, k, views=one_view(2.0) if k == 20 else None).scene
+    merged = merge(scene, k, views=views_from_within((-2.0, 0.5, 0.5), 1, 64, 64) if k == 20 else None).scene
     assert len(merged) == k and merged.dtype == scene.dtype
     assert bool(merged.usable().all())
 

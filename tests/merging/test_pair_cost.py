@@ -36,20 +36,14 @@ def disks(seed: int = 1, logits: tuple[float, float] = (0.3, -0.6)) -> Gaussians
     return splats(means, scales, torch.tensor(logits)[:, None], colours, quats)
 
 
-def cost_along_z(scene: Gaussians) -> float:
-    """The cost of merging the first of two Gaussians with the second, along the z axis."""
-    direction = int(DIRECTIONS[:, 2].abs().argmax())
-    assert float(DIRECTIONS[direction, 2].abs()) == 1.0
-    plane, i, j = torch.tensor([direction]), torch.tensor([0]), torch.tensor([[1]])
-    return float(costs_in_plane(state_of(scene), i, j, plane, MERGING, torch.float32))
-
-
 @pytest.mark.parametrize(("logits", "grows"), [((0.3, -0.6), False), ((6.0, 6.0), True)])
 def test_the_cost_is_the_integral_that_it_claims_to_be(logits, grows):
     """Against a sum over a fine grid in the plane, in float64."""
     scene = disks(logits=logits)
     state = state_of(scene)
-    got = cost_along_z(scene)
+    direction = int(DIRECTIONS[:, 2].abs().argmax())  # the z axis
+    first, second, plane = torch.tensor([0]), torch.tensor([[1]]), torch.tensor([direction])
+    got = float(costs_in_plane(state, first, second, plane, MERGING, torch.float32))
     axis = torch.linspace(-0.6, 0.7, 1301, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
     cov = algebra.unpack(state.cov.double())[:, :2, :2]
@@ -139,17 +133,10 @@ def test_kernels_are_as_near_to_float64_as_torch_is(k, axes):
 
 def test_float32_costs_rank_pairs_as_float64_does():
     """Needles 1000 times as long as thick, which float32 cannot tell from lines without a floor on their width."""
-    g = torch.Generator().manual_seed(1)
-    n = 200
-    scene = Gaussians(
-        means=torch.rand(n, 3, generator=g),
-        scales=torch.tensor([-2.0, -5.0, -9.0]) + 0.3 * torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        opacities=torch.randn(n, 1, generator=g),
-        features_dc=torch.randn(n, 3, generator=g),
-        features_rest=torch.zeros(n, 0, 3),
-    )
-    state, near = state_of(scene), torch.randint(0, n, (n, 8), generator=g)
+    scene = cloud(200, seed=1, sh_degree=0)
+    scene = scene.replace(scales=torch.tensor([-2.0, -5.0, -9.0]) + 0.6 * (scene.scales + 3))
+    near = torch.randint(0, 200, (200, 8), generator=torch.Generator().manual_seed(1))
+    state = state_of(scene)
     a, b = (pair_costs(state, near, dtype=dtype, compiled=False) for dtype in (torch.float64, torch.float32))
     assert float((a - b).abs().max()) < 2e-3 * float(a.max())  # 1e-3 of an area, squared
 

@@ -112,13 +112,6 @@ def test_pairs_are_the_cheapest_of_both_members_pass_by_pass(n):
 ALL = torch.arange(200)
 
 
-def random_groups(scene: Gaussians, count: int) -> torch.Tensor:
-    """Groups by chance, none empty."""
-    group = torch.randint(count, (len(scene),), generator=torch.Generator().manual_seed(2))
-    group[:count] = torch.arange(count)
-    return group
-
-
 def moments_of(scene: Gaussians, group: torch.Tensor, count: int) -> Moments:
     """Moments of groups of all."""
     return group_moments(Members(scene, ALL), group, count)
@@ -133,7 +126,7 @@ def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def test_moments_are_those_of_the_members_and_between_them():
-    scene, group = cloud(200), random_groups(cloud(200), 7)
+    scene, group = cloud(200), ALL % 7
     assert torch.equal(after(scene, group, 7).unique(), torch.arange(7)), "no group is left empty"
     groups = moments_of(scene, group, 7)
     masses = Members(scene, ALL).masses

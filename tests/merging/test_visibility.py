@@ -51,10 +51,9 @@ def test_weights_fall_with_the_square_of_the_distance():
     assert float(near.median() / far.median()) == pytest.approx(4, rel=0.1)
 
 
-@pytest.mark.parametrize("rows", [16, 64, 256])
-def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel(rows):
+def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel():
     """Of 256 in a row, each is 0.2 pixels large. Widened by 0.3 pixels, it would weigh ten times as much."""
-    coarse, fine = aside(wall(0, rows=16), -1.2), aside(wall(0, rows=rows), 1.2)
+    coarse, fine = aside(wall(0, rows=16), -1.2), aside(wall(0, rows=256), 1.2)
     found = weights_of(Gaussians.cat([coarse, fine]), of_origin((0, 0, -4)))
     assert 0.5 < float(found[256:].median() / found[:256].median()) < 2
 

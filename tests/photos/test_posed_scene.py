@@ -27,13 +27,6 @@ def views(scene) -> ps.Views:
     return views_from_within((0.0, 0.0, 0.0), 6, 64, 48)
 
 
-def moved(views: ps.Views, by: float) -> ps.Views:
-    """Cameras that stand elsewhere and look the same way."""
-    poses = invert_rigid(views.viewmats)
-    poses[:, :3, 3] += by
-    return replace(views, viewmats=invert_rigid(poses))
-
-
 def in_dataset(views: ps.Views, folder: Path) -> tuple[dict, str]:
     """``transforms.json`` of cameras in the frame of a dataset, and the transforms that lead into the scene's."""
     poses = invert_rigid(views.viewmats.double())
@@ -139,22 +132,17 @@ def rotation(seed=SEED):
     return q * torch.linalg.det(q).sign()
 
 
-def rendered_alike(before, after, similarity):
-    """Whether two scenes look the same from cameras that are moved along."""
-    views = ps.sample_views(before, 2, width=48, height=36)
-    inverse = similarity.inverse()
+def test_a_scene_that_is_moved_looks_the_same_from_cameras_that_move_along():
+    scene = cloud(300, SEED, 3).to(dtype=torch.float64)
+    similarity = Similarity(rotation(), 2.5, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
+    views, inverse = ps.sample_views(scene, 2, width=48, height=36), similarity.inverse()
     viewmats = views.viewmats.clone()
     viewmats[:, :3, :3] = views.viewmats[:, :3, :3] @ inverse.matrix
     # The camera's axes keep their unit, so that depths grow with the scene.
     viewmats[:, :3, 3] = similarity.scale * (views.viewmats[:, :3, :3] @ inverse.offset + views.viewmats[:, :3, 3])
     moved = replace(views, viewmats=viewmats, near_plane=similarity.scale * views.near_plane)
-    return float((ps.render(before, views) - ps.render(after, moved)).abs().max())
-
-
-def test_a_scene_that_is_moved_looks_the_same_from_cameras_that_move_along():
-    scene = cloud(300, SEED, 3).to(dtype=torch.float64)
-    similarity = Similarity(rotation(), 2.5, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
-    assert rendered_alike(scene, similarity.apply(scene), similarity) < 1e-4  # the steps of blending are float32
+    apart = ps.render(scene, views) - ps.render(similarity.apply(scene), moved)
+    assert float(apart.abs().max()) < 1e-4  # the steps of blending are float32
 
 
 def test_up_is_turned_to_where_it_is_wanted():

@@ -9,6 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from making import run_of
+from pointsplat_ns.cli import main
 from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
 from posing import inria, nerfstudio, write_colmap_text, write_photos
@@ -35,6 +36,7 @@ def test_cameras_that_3dgs_training_wrote_are_used_and_named(place, scene, views
     (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
     assert same(known(path), views)
     assert f"poses: {tmp_path / 'cameras.json'}; --poses none" in said.text
+    main(["prune", str(path), "--keep", "100", "--poses", "none"])
     assert known(path, "none") is None and known(path.parent / path.name, str(tmp_path / "cameras.json")) is not None
 
 
@@ -61,16 +63,6 @@ def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, vie
     assert same(known(path), views)
     write_photos(scene, views[torch.arange(len(views)).flip(0).tolist()], tmp_path / "images")
     assert known(path) is None and "no more like the photos of their views than like others" in said.text
-
-
-def test_commands_take_the_word_none(scene, views, tmp_path, capsys):
-    from pointsplat_ns.cli import main
-
-    ps.save(scene, tmp_path / "room.ply")
-    (tmp_path / "cameras.json").write_text(json.dumps(inria(views)))
-    for words, named in (((), True), (("--poses", "none"), False)):
-        main(["prune", str(tmp_path / "room.ply"), "--keep", "100", "--force", *words])
-        assert ("cameras.json" in capsys.readouterr().out) == named
 
 
 def test_damaged_files_beside_a_scene_stop_nothing(scene, tmp_path, said):

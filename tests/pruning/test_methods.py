@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from making import normal_scene, same, same_bits
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.pruning import (
     METHODS,
     Megabytes,
@@ -36,13 +37,10 @@ WITHOUT_OPACITY_WEIGHT = [name for name, method in METHODS.items() if not method
 UNKNOWN = "no method is called 'best'; expected one of merge, coverage, paper, auth"
 
 
-def views(count: int = 2) -> Views:
-    """Cameras before the origin that look at it."""
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
-    viewmats[:, 2, 3] = 6.0
-    viewmats[:, 0, 3] = 0.5 * torch.arange(count)
-    K = torch.tensor([[10.0, 0, 5], [0, 10, 4.5], [0, 0, 1]], dtype=torch.float64)
-    return Views(viewmats, K.repeat(count, 1, 1), 10, 9, torch.zeros(3))
+def views() -> Views:
+    """Two cameras before the origin that look at it."""
+    eyes = torch.tensor([[0.0, 0.0, -6.0], [-0.5, 0.0, -6.0]], dtype=torch.float64)
+    return views_of(look_at(eyes, torch.zeros_like(eyes)), 10, 9, 5.0)
 
 
 def kept(scene, keep, by="paper", **options):

@@ -5,29 +5,19 @@ import math
 import pytest
 import torch
 
+from making import normal_scene
 from pointsplat_ns.errors import DataError
-from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.pruning.view_scores import lightgaussian_score, log_determinant, pup_score, sensitivity
-from pointsplat_ns.rasterizer import rasterization
+from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
 WIDTH, HEIGHT = 10, 9  # four tiles, three of them cut off
 
 
 def make(n=8, degree=2, seed=3, dtype=torch.float64):
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=generator, dtype=dtype)
-
-    return Gaussians(
-        means=0.4 * normal(n, 3),
-        scales=0.3 * normal(n, 3) - 1.5,
-        quats=normal(n, 4),
-        opacities=normal(n, 1) + 1,
-        features_dc=normal(n, 3),
-        features_rest=0.3 * normal(n, (degree + 1) ** 2 - 1, 3),
-    )
+    scene = normal_scene(n, degree, seed, dtype)
+    shape = {"means": 0.4 * scene.means, "scales": 0.3 * scene.scales - 1.5, "opacities": scene.opacities + 1}
+    return scene.replace(**shape, features_rest=0.3 * scene.features_rest)
 
 
 def views(mode="classic", count=2):
@@ -41,35 +31,16 @@ def views(mode="classic", count=2):
 def hessians_by_definition(scene, views):
     """Every channel of every pixel differentiated by itself."""
     total = torch.zeros(len(scene), 6, 6, dtype=scene.dtype)
-    for i in range(len(views)):
+    for view in views:
         means, scales = scene.means.clone().requires_grad_(), scene.scales.clone().requires_grad_()
-        image, alpha, _ = rasterization(
-            means,
-            scene.quats,
-            scales.exp(),
-            scene.alphas,
-            scene.sh,
-            views.viewmats[i : i + 1].to(scene.dtype),
-            views.Ks[i : i + 1].to(scene.dtype),
-            WIDTH,
-            HEIGHT,
-            sh_degree=scene.sh_degree,
-            rasterize_mode=views.rasterize_mode,
-        )
-        image = image[0] + (1 - alpha[0]) * views.background.to(image)
-        for value in image.reshape(-1):
+        for value in render(scene.replace(means=means, scales=scales), view).reshape(-1):
             gradient = torch.cat(torch.autograd.grad(value, (means, scales), retain_graph=True), dim=1)
             total += gradient[:, :, None] * gradient[:, None, :]
     return total
 
 
 @pytest.mark.parametrize(
-    ("case", "mode"),
-    [
-        ("opaque", "antialiased"),
-        ("behind a wall", "classic"),
-        ("one colour", "classic"),
-    ],
+    ("case", "mode"), [("opaque", "antialiased"), ("behind a wall", "classic"), ("one colour", "classic")]
 )
 def test_the_hessian_is_the_sum_over_pixels_of_outer_products(case, mode):
     scene = make(degree=0 if case == "one colour" else 2)  # whose colours do not depend on the direction

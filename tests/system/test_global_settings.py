@@ -1,62 +1,17 @@
 """torch's global settings, which other code of the process may have changed, change no result."""
 
-import ast
 import dataclasses
 from contextlib import contextmanager
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
-from torch.utils._device import _device_constructors
 
 import pointsplat_ns as ps
 from making import box_room, move_zero_layers
 from pointsplat_ns.compression import repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
-
-PACKAGE = Path(ps.__file__).parent
-
-MAKERS = {function.__name__ for function in _device_constructors()}
-"""Functions of torch whose tensor is on the default device unless a device is named."""
-
-OF_FIXED_TYPE = {"randperm", "randint", "tril_indices", "triu_indices"}
-"""Makers of int64, whatever the default type."""
-
-LAYERS = {name for name, kind in vars(nn).items() if isinstance(kind, type) and "dtype" in signature(kind).parameters}
-"""Layers whose parameters have the default type and are on the default device unless both are named."""
-
-NAMED_BY = {"FLOATS", "DOUBLES", "INDICES", "FLAGS", "of_network()"}
-"""Arguments ``**x`` that name a type and a device; see :mod:`pointsplat_ns.system.tensors`."""
-
-
-def unnamed(text: str) -> list[tuple[int, str]]:
-    """Line and call of every tensor or layer that a program makes without a type or a device."""
-    found = []
-    for node in ast.walk(ast.parse(text)):
-        if not isinstance(node, ast.Call):
-            continue
-        module, _, name = ast.unparse(node.func).rpartition(".")
-        wanted = {"dtype", "device"}
-        if module == "torch" and name in MAKERS:
-            wanted -= {"dtype"} if name in OF_FIXED_TYPE else set()
-        elif module not in ("nn", "torch.nn") or name not in LAYERS:
-            continue
-        by = {word.arg for word in node.keywords}
-        if any(word.arg is None and ast.unparse(word.value) in NAMED_BY for word in node.keywords):
-            by |= wanted
-        if not wanted <= by:
-            found.append((node.lineno, ast.unparse(node)))
-    return found
-
-
-def test_every_tensor_of_the_package_is_made_with_type_and_device():
-    assert len(MAKERS) > 20 and {"Linear", "Conv2d", "LayerNorm", "Embedding"} <= LAYERS
-    assert len(unnamed("torch.zeros(3)\ntorch.eye(3, device=x.device)\nnn.Linear(3, 4)\ntorch.ones(2, **FLOATS)")) == 3
-    files = {str(path.relative_to(PACKAGE)): unnamed(path.read_text("utf-8")) for path in PACKAGE.rglob("*.py")}
-    assert {path: calls for path, calls in files.items() if calls} == {}
 
 
 @contextmanager
