@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import statistics
 from pathlib import Path
 
 import pytest
@@ -10,13 +9,12 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.programs import Usage, run_measured
-from lab.judge import ablation, camera_paths, cleaning, judge, levels, record, refiners, scenes
+from lab.judge import ablation, camera_paths, cleaning, judge, levels, refiners, scenes
 from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
 from pointsplat_ns.cli import main
 from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
@@ -97,20 +95,6 @@ def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp
     assert "photo PSNR" in " ".join(capsys.readouterr().out.split())
 
 
-def test_means_and_leads_are_over_scenes_that_have_every_way():
-    rows = [
-        {"scene": scene, "keep": 0.1, "method": method, "at": 960, "failed": "", "cpu_seconds": 1.0, "peak_bytes": 1e9}
-        | dict.fromkeys(scenes.MEASURES)
-        | {"covered_psnr": psnr}
-        for scene, *psnrs in (("rock", 25, 27, 24, 23), ("chair", 30, 31, 26, 28), ("can", 40, 41))
-        for method, psnr in zip(("prune", "compact", "splat-transform 3 -d", "splat-transform 2"), psnrs, strict=False)
-    ]
-    figures = record.Figures(rows)
-    text = record.section(figures, 960)
-    row = "| 10 % | 26.00 | 27.50 | 29.00 | +1.50 (+1.00 rock) | +1.50 (+1.00 chair) |"
-    assert figures.scenes(960) == "2" and row in text
-
-
 def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_path, capsys):
     ps.lod(small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48))
     results = tmp_path / "levels.json"
@@ -122,14 +106,6 @@ def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_
 
 
 TWO = ("no_regrouping", "growth_0")
-
-
-def test_each_field_of_merging_is_changed_by_some_variant():
-    changed = {field for found in ablation.VARIANTS.values() for field in found}
-    known = vars(MERGING) | vars(LOOKING)
-    assert vars(MERGING).keys() <= changed <= known.keys()
-    for name, found in ablation.VARIANTS.items():
-        assert any(known[field] != value for field, value in found.items()), name
 
 
 def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
@@ -165,18 +141,6 @@ def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, t
     pruned = ps.prune(scene.dense, keep=0.5, by="opacity")
     [(_, _, expected)] = scenes.losses(scene, [pruned], None)
     assert rows[0]["pruned_psnr"] == expected["covered_psnr"]
-
-
-def test_gains_are_means_over_scenes_and_their_spread_is_over_trainings():
-    gains = {("a", 0): 1.0, ("a", 1): 2.0, ("b", 0): 3.0, ("b", 1): 6.0}  # dB, by scene and training
-    common = {"method": "dual", "by": "paper", "keep": 0.1, "pruned_psnr": 20.0}
-    rows = [common | {"scene": scene, "number": number, "psnr": 20 + g} for (scene, number), g in gains.items()]
-    rows.append({**common, "scene": "a", "method": "concat", "number": 2, "psnr": 19.5})
-    spread = f"{statistics.stdev([2.0, 4.0]):.2f}"
-    assert refiners.lines(rows) == [
-        ["dual", "paper", "10 %", "2", "+3.00", spread],
-        ["concat", "paper", "10 %", "1", "-0.50", "-"],
-    ]
 
 
 def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):
