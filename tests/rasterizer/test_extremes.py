@@ -99,7 +99,7 @@ def _needles(scene):
 
 def _stacked(scene):
     scene[3][:] = 1.0
-    scene[0][:30] = scene[0][0]
+    scene[0][:30] = torch.tensor([0.0, 0.0, 3.0], dtype=F64)
 
 
 def _any_length(scene):

@@ -90,13 +90,15 @@ def surface(n: int, seed: int = 0) -> torch.Tensor:
     return means
 
 
-def test_clusters_hold_exactly_the_points_of_a_cell():
+def test_clusters_hold_exactly_the_points_of_a_cell_and_orders_are_permutations():
     means = surface(800)
     config = preset("full", grid=64)
     structure = build_structure(scene_at(means), config)
     position = structure.cube.positions(means)[structure.order] + 0.5
     cluster = torch.arange(800)
     for level, stride in zip(structure.levels, (1, 2, 4, 8), strict=False):
+        for order, inverse in level.orders[1:]:
+            assert torch.equal(order[inverse], torch.arange(level.size))
         cluster = level.cluster[cluster]
         assert set(cluster.diff().tolist()) <= {0, 1}, "cells of a level are runs without gaps"
         cells = (position * 64 / stride).floor().clamp(max=64 // stride - 1).long()
