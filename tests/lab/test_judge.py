@@ -9,7 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.programs import Usage, run_measured
-from lab.judge import ablation, camera_paths, cleaning, judge, levels, refiners, scenes
+from lab.judge import ablation, camera_paths, cleaning, judge, levels, record, refiners, scenes
 from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
@@ -93,6 +93,20 @@ def test_a_run_is_judged_by_its_held_out_photos_in_their_size(trained_walls, tmp
     assert (row["scene"], row["at"], row["views"]) == ("wall-a", "photos", 2)
     assert 0 < row["photo_psnr"] < 100 and row["photo_psnr"] != row["dense_psnr"]
     assert "photo PSNR" in " ".join(capsys.readouterr().out.split())
+
+
+def test_means_and_leads_are_over_scenes_that_have_every_way():
+    rows = [
+        {"scene": scene, "keep": 0.1, "method": method, "at": 960, "failed": "", "cpu_seconds": 1.0, "peak_bytes": 1e9}
+        | dict.fromkeys(scenes.MEASURES)
+        | {"covered_psnr": psnr}
+        for scene, *psnrs in (("rock", 25, 27, 24, 23), ("chair", 30, 31, 26, 28), ("can", 40, 41))
+        for method, psnr in zip(("prune", "compact", "splat-transform 3 -d", "splat-transform 2"), psnrs, strict=False)
+    ]
+    figures = record.Figures(rows)
+    text = record.section(figures, 960)
+    row = "| 10 % | 26.00 | 27.50 | 29.00 | +1.50 (+1.00 rock) | +1.50 (+1.00 chair) |"
+    assert figures.scenes(960) == "2" and row in text
 
 
 def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_path, capsys):
