@@ -11,7 +11,7 @@ from foreign import write_sog_folder
 from refusing import fails
 
 import pointsplat_ns as ps
-from making import cloud, normal_scene
+from making import cloud, normal_scene, same_bits
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.io.discovery import FOLDER_FILES, find_scenes
@@ -72,15 +72,6 @@ def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
     assert path.read_text() == "new" and stat.S_IMODE(path.stat().st_mode) == mode
 
 
-def test_an_error_in_the_block_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_text("old")
-    with pytest.raises(KeyError), replacing(path) as part:
-        part.write_text("half")
-        raise KeyError
-    assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
-
-
 @pytest.mark.parametrize("name", ["a.ply", "a.sog"])
 def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     path = tmp_path / name
@@ -92,9 +83,12 @@ def test_a_scene_replaces_a_file_only_where_it_is_to(tmp_path, name):
     assert len(ps.load(path)) == 4
 
 
-def test_a_sog_folder_is_known_by_all_its_files(tmp_path):
+def test_a_sog_folder_is_read_by_both_names_and_known_by_all_its_files(tmp_path):
     folder = tmp_path / "room"
     write_sog_folder(normal_scene(5), folder)
+    ps.save(normal_scene(5), tmp_path / "room.sog")
+    scenes = [ps.load(place) for place in (tmp_path / "room.sog", folder, folder / "meta.json")]
+    assert same_bits(scenes[0], scenes[1]) and same_bits(scenes[0], scenes[2])
     source = source_file(folder)
     assert source.name == "room" and source == source_file(folder / "meta.json")
     assert source.bytes == sum(part.stat().st_size for part in folder.iterdir())
@@ -114,7 +108,9 @@ def test_only_files_and_the_newest_run_of_each_experiment_are_scenes(make_run, t
     folder = tmp_path / "outputs"
     make_run("kitchen", time="2024-05-06_070809", steps=(9,))
     newest = make_run("kitchen", method="splatfacto-cpu", time="2025-05-06_070809", steps=(19,))
-    make_run("of-another-kind", method="nerfacto")
+    make_run("kitchen", time="2026-05-06_070809", steps=())
+    for method in ("nerfacto", "pointsplat"):
+        make_run("of-another-kind", method=method)
     write_ply(cloud(3), newest / "compact.ply")  # in the folder of a run
     for name in ("hall.ply", "deep/er/HALL.PLY", "kitchen.ply", ".hidden/x.ply", "made/y.ply"):
         write_ply(cloud(3), folder / name)

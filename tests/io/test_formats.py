@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from compressed_plys import encode_compressed_ply
-from foreign import encode_spz4, write_sog_folder
+from foreign import encode_spz4
 from plys import columns_of, write_columns
 from refusing import fails
 
@@ -157,14 +157,6 @@ def test_spz_4_is_read_as_spz_3_and_extensions_are_said_to_be_left_out(tmp_path,
     (tmp_path / "4.spz").write_bytes(encode_spz4(scene, struct.pack("<II4s", 7, 4, b"what")))
     assert same_bits(ps.load(tmp_path / "3.spz"), ps.load(tmp_path / "4.spz"))
     assert caplog.messages == [f"{tmp_path / '4.spz'}: extensions of the SPZ file are not read"]
-
-
-def test_a_sog_folder_is_read_by_both_names_and_equals_the_file(tmp_path):
-    scene = cloud(1500, 0, 3)
-    write_sog_folder(scene, tmp_path / "room")
-    ps.save(scene, tmp_path / "room.sog")
-    scenes = [ps.load(tmp_path / "room"), ps.load(tmp_path / "room" / "meta.json"), ps.load(tmp_path / "room.sog")]
-    assert same_bits(scenes[0], scenes[1]) and same_bits(scenes[0], scenes[2])
 
 
 def test_degree_4_of_a_ply_is_read_up_to_3(tmp_path, caplog):

@@ -54,15 +54,6 @@ def test_no_infinite_value_is_read_or_written_and_what_is_drawn_stays(tmp_path, 
     assert all(np.isfinite(written[name]).all() for name in written.dtype.names) and len(written) == 8
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_properties_in_any_order_and_unknown_ones_are_fine(tmp_path, text):
-    scene = normal_scene(5, 1)
-    columns = dict(reversed(columns_of(scene).items())) | {"red": np.zeros(5, "u1"), "weight": np.zeros(5)}
-    columns["x"] = columns["x"].astype(np.float64)
-    before = PlyElement.describe(np.zeros(3, [("a", "i4"), ("b", "u1")]), "camera")
-    assert same_bits(scene, read_ply(write_columns(tmp_path / "a.ply", columns, text, before=[before])))
-
-
 def test_a_sparse_file_that_would_fill_the_memory_is_refused(tmp_path):
     path = tmp_path / "a.ply"
     write_ply(normal_scene(1, 3), path)

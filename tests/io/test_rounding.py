@@ -11,7 +11,7 @@ from plyfile import PlyElement
 from plys import columns_of, write_columns
 
 import pointsplat_ns as ps
-from making import cloud, same_bits
+from making import cloud, same_bits, splats
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
@@ -22,17 +22,6 @@ from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for, steps_of
 from pointsplat_ns.merging.covariance import covariances, unpack
 
 SILENT = lambda *told: None  # noqa: E731
-
-
-def one() -> Gaussians:
-    return Gaussians(
-        means=torch.zeros(1, 3),
-        scales=torch.tensor([[0.2, 0.1, 0.1]]).log(),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        opacities=torch.zeros(1, 1),
-        features_dc=torch.zeros(1, 3),
-        features_rest=torch.zeros(1, 0, 3),
-    )
 
 
 def values(scene: Gaussians) -> torch.Tensor:
@@ -49,7 +38,7 @@ def values(scene: Gaussians) -> torch.Tensor:
     ("name", "change"), [("means", [0.0, 1.0, 0.0]), ("scales", [0.0, 1.0, 0.0]), ("quats", [0.0, 0.0, 0.0, 1.0])]
 )
 def test_a_step_changes_a_gaussian_by_its_tolerance_over_the_contrast(name, change):
-    scene, tolerance = one(), 1e-3
+    scene, tolerance = splats(torch.zeros(1, 3), torch.tensor([0.2, 0.1, 0.1]).log(), 0.0), 1e-3
     steps = {"means": "means", "scales": "log_scales", "quats": "quats"}
     error = getattr(steps_of(scene, tolerance), steps[name]) / math.sqrt(12)
     changed = scene.replace(**{name: getattr(scene, name) + error.float() * torch.tensor([change])})

@@ -7,8 +7,8 @@ import pytest
 import torch
 from refusing import fails
 
-from making import normal_scene, same
-from pointsplat_ns.io import find_runs, open_run, read_scene, save, scene_name
+from making import normal_scene
+from pointsplat_ns.io import find_runs, open_run, read_scene, save
 from pointsplat_ns.io.inert_yaml import Tagged
 
 
@@ -61,18 +61,6 @@ def test_what_is_no_run_is_said(tmp_path):
     fails(lambda: open_run(tmp_path), tmp_path / "config.yml", "lacks the object 'pipeline'")
 
 
-def test_the_newest_finished_run_of_each_experiment_is_found(make_run, tmp_path):
-    make_run("room", time="2024-05-06_070809")
-    newest = make_run("room", method="splatfacto-cpu", time="2024-06-01_000000")
-    make_run("room", time="2024-07-01_000000", steps=())
-    kitchen = make_run("kitchen", method="splatfacto-big")
-    make_run("kitchen", method="pointsplat", time="2025-01-01_000000")
-    runs = find_runs(tmp_path)
-    assert [run.folder for run in runs] == [kitchen, newest]
-    assert [scene_name(run) for run in runs] == ["kitchen", "room"]
-    assert find_runs(newest)[0].folder == newest
-
-
 def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, tmp_path):
     folder = make_run(method="nerfacto")
     assert not open_run(folder).is_gaussian_scene
@@ -80,15 +68,6 @@ def test_other_methods_are_passed_over_and_said_where_nothing_is_left(make_run, 
     (tmp_path / "empty").mkdir()
     fails(lambda: find_runs(tmp_path / "empty"), "EXPERIMENT/METHOD/TIME/config.yml")
     fails(lambda: find_runs(tmp_path / "none"), "no such folder")
-
-
-def test_every_kind_of_path_reads_the_same_scene(make_run, tmp_path):
-    scene = normal_scene(6, 2)
-    folder = make_run(scene=scene)
-    save(scene, tmp_path / "deep" / "er" / "scene.PLY")
-    paths = [folder, folder / "config.yml", open_run(folder).checkpoint, tmp_path / "deep" / "er" / "scene.PLY"]
-    for path in paths:
-        assert same(read_scene(path), scene), path
 
 
 def test_anything_else_is_refused_with_what_is_accepted(tmp_path):

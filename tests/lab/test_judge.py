@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import statistics
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from making import box_room, move_zero_layers, run_of
 from peers import peer
 from pointsplat_ns.cli import main
 from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
@@ -124,14 +122,6 @@ def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_
 TWO = ("no_regrouping", "growth_0")
 
 
-def test_each_field_of_merging_is_changed_by_some_variant():
-    changed = {field for found in ablation.VARIANTS.values() for field in found}
-    known = vars(MERGING) | vars(LOOKING)
-    assert vars(MERGING).keys() <= changed <= known.keys()
-    for name, found in ablation.VARIANTS.items():
-        assert any(known[field] != value for field, value in found.items()), name
-
-
 def test_a_variant_has_the_psnr_of_what_merging_makes_with_its_settings(small, tmp_path, capsys):
     results = tmp_path / "rows.json"
     ablation.main((small,), keep=(0.2,), variants=TWO, views=2, width=64, json_path=results)
@@ -165,18 +155,6 @@ def test_a_refiner_gains_what_it_brings_closer_an_untrained_one_nothing(small, t
     pruned = ps.prune(scene.dense, keep=0.5, by="opacity")
     [(_, _, expected)] = scenes.losses(scene, [pruned], None)
     assert rows[0]["pruned_psnr"] == expected["covered_psnr"]
-
-
-def test_gains_are_means_over_scenes_and_their_spread_is_over_trainings():
-    gains = {("a", 0): 1.0, ("a", 1): 2.0, ("b", 0): 3.0, ("b", 1): 6.0}  # dB, by scene and training
-    common = {"method": "dual", "by": "paper", "keep": 0.1, "pruned_psnr": 20.0}
-    rows = [common | {"scene": scene, "number": number, "psnr": 20 + g} for (scene, number), g in gains.items()]
-    rows.append({**common, "scene": "a", "method": "concat", "number": 2, "psnr": 19.5})
-    spread = f"{statistics.stdev([2.0, 4.0]):.2f}"
-    assert refiners.lines(rows) == [
-        ["dual", "paper", "10 %", "2", "+3.00", spread],
-        ["concat", "paper", "10 %", "1", "-0.50", "-"],
-    ]
 
 
 def test_each_strength_is_measured_in_held_out_photos(trained_walls, capsys):

@@ -9,7 +9,6 @@ from lab.judge import ablation, record, tables_record
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
-from lab.training import with_photos
 from making import box_room
 from peers import peer
 from pointsplat_ns.io import write_ply
@@ -22,7 +21,6 @@ PAGES = {
     "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD / "encoders.json"),
     "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
     "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
-    "with_photos.md": lambda: with_photos.page(record.read([RECORD / "with_photos.json"], "with_photos.py")[0]),
     "judge.md": lambda: record.page(*record.read(JUDGED)),
 }
 

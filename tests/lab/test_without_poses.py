@@ -11,7 +11,6 @@ from plyfile import PlyData
 
 import pointsplat_ns as ps
 from captures import FRAMES, HEIGHT, OPENCV_TO_OPENGL, WIDTH, Capture, Lens
-from lab.common.scenes import group_of
 from lab.judge import captures, without_poses
 from lab.judge.scenes import load, losses
 from making import box_room, run_of
@@ -21,15 +20,6 @@ from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 
 KNOWN = captures.Capture("owner/name", "0" * 40, "images", "transforms.json", FRAMES, (WIDTH, HEIGHT), "room", "walls")
 BENT = Lens(distortion=(0.12, -0.03, 0.002, -0.001))
-
-
-def test_captures_are_named_for_one_purpose_and_rooms_are_among_both():
-    groups = {name: group_of(name) for name in captures.CAPTURES}
-    assert {*groups.values()} == {"tuning", "judged"}
-    for group in ("tuning", "judged"):
-        assert [name for name in groups if groups[name] == group and captures.CAPTURES[name].kind == "room"]
-    for found in captures.CAPTURES.values():
-        assert 25 <= found.count <= 300 and len(found.commit) == 40 and found.repository.count("/") == 1
 
 
 def ready(clone: Path, target: Path, known: captures.Capture, side: int) -> list[dict]:

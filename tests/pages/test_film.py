@@ -96,11 +96,6 @@ def test_another_size_shows_as_much_from_top_to_bottom():
     assert torch.equal(fitted(views, 64, 48).Ks, views.Ks)
 
 
-def test_no_views_are_refused():
-    with pytest.raises(ps.DataError, match="expected at least one"):
-        along(captured()[:0], 5)
-
-
 def test_labels_stand_at_the_top_of_their_halves_and_are_shortened():
     blank = np.full((200, 400, 3), 128, np.uint8)
     both = with_labels(blank, ["dense", "ein Zehntel, 小"]) != 128

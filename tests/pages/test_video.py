@@ -59,6 +59,8 @@ def test_nothing_is_left_of_what_was_interrupted(name, error, tmp_path):
 def test_what_was_there_stays_until_all_is_written(tmp_path):
     write_frames(drawn(4), tmp_path / "frames", 12)
     before = {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()}
+    with pytest.raises(ps.SceneError, match="--force"):
+        write_frames(drawn(2), tmp_path / "frames", 12)
 
     def interrupted() -> Iterator[np.ndarray]:
         yield drawn(1)[0] // 2
@@ -69,14 +71,6 @@ def test_what_was_there_stays_until_all_is_written(tmp_path):
     assert {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()} == before
     write_frames(drawn(2), tmp_path / "frames", 12, force=True)
     assert len([*(tmp_path / "frames").iterdir()]) == 2, "frames of the longer film are gone"
-
-
-@pytest.mark.parametrize("name", ["film.mp4", "one.png", "frames"])
-def test_nothing_is_overwritten_unasked(name, tmp_path):
-    write_frames(drawn(1), tmp_path / name, 12)
-    with pytest.raises(ps.SceneError, match="--force"):
-        write_frames(drawn(1), tmp_path / name, 12)
-    write_frames(drawn(1), tmp_path / name, 12, force=True)
 
 
 def test_folders_of_others_are_left_alone(tmp_path):

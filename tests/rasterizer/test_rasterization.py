@@ -147,14 +147,3 @@ def test_the_differences_from_gsplat_are_those_that_the_page_lists():
     again, *_ = rasterization(*scene, sh_degree=1, **given)
     assert image.any() and torch.equal(image, again)
     assert [*given] == listed.pop("Arguments without effect") and not listed
-
-
-def test_gaussians_at_one_depth_are_drawn_in_the_order_given():
-    scene = splats_in_view(60, 4, spread=1.0, scale=-1.5)
-    view, K = camera_askew()
-    view[:3, :3] = torch.eye(3, dtype=F64)
-    pictures = []
-    for step in (0.0, 1e-9):
-        scene[0][:, 2] = 3.0 + step * torch.arange(60, dtype=F64)
-        pictures.append(rasterization(*scene, view[None], K[None], 31, 26, sh_degree=3)[0])
-    assert pictures[0].any() and (pictures[0] - pictures[1]).abs().max() < 1e-5

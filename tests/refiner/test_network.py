@@ -75,12 +75,6 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def structure_of(means: torch.Tensor, config):
-    n = len(means)
-    tails = ((3,), (4,), (1,), (3,), (0, 3))
-    return build_structure(Gaussians(means, *(torch.zeros(n, *tail) for tail in tails)), config)
-
-
 def plain_attention(module: PatchAttention, x: torch.Tensor) -> torch.Tensor:
     """Softmax attention written out, over all rows."""
     m, c = x.shape
@@ -106,7 +100,7 @@ def test_patches_attend_within_themselves_and_the_last_borrows(n, patch):
 def test_points_of_a_cell_get_the_dense_convolution_of_their_mean():
     config = preset("full", grid=4)
     means = torch.rand(40, 3, generator=seeded())
-    structure = structure_of(means, config)
+    structure = build_structure(normal_scene(40).replace(means=means), config)
     level = structure.levels[0]
     assert level.cell_of is not None
     torch.manual_seed(0)

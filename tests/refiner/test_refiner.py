@@ -3,21 +3,15 @@
 import pytest
 import torch
 
-from making import same, small_refiner
+from making import cloud, same, small_refiner
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 
 
-def scene_to_refine(n: int = 200, sh_degree: int = 3, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
+def scene_to_refine(n: int = 200, sh_degree: int = 3, dtype: torch.dtype = torch.float32) -> Gaussians:
     """Small blobs, uniform in a cube of side 4."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def randn(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    means = torch.rand(n, 3, generator=generator, dtype=torch.float64).to(dtype) * 4
-    rest = (sh_degree + 1) ** 2 - 1
-    return Gaussians(means, randn(n, 3) - 4, randn(n, 4), randn(n, 1) * 2, randn(n, 3), randn(n, rest, 3) * 0.1)
+    scene = cloud(n, sh_degree=sh_degree).to(dtype)
+    return scene.replace(means=4 * scene.means)
 
 
 ENCODERS = pytest.mark.parametrize("encoder", ["dual", "concat"])

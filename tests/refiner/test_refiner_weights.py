@@ -21,7 +21,6 @@ from pointsplat_ns.refiner import (
     read_refiner,
     save_refiner,
 )
-from pointsplat_ns.refiner.config import RefinerConfig
 from pointsplat_ns.refiner.weights import REFINER_FORMAT
 
 
@@ -111,12 +110,9 @@ def test_files_whose_contents_do_not_fit_are_refused(tmp_path):
 
 HUGE = [
     {"enc_channels": [1 << 40, 48, 64]},
-    {"enc_channels": [1 << 16, 1 << 16, 1 << 16]},
     {"feature_dim": 1 << 16, "color_hidden": 1 << 16, "color_dim": 1 << 16},
-    {"head_width": 1 << 40},
     {"head_depth": 1 << 40},
     {"enc_depths": [1 << 16, 1, 1]},
-    {"mlp_ratio": 1 << 16},
     {"patch": 1 << 40},
 ]
 
@@ -184,12 +180,8 @@ def test_a_header_that_is_no_json_object_is_one_error(key, text, tmp_path):
         ({"strides": (2, 3)}, "strides holds 3; expected powers of two"),
         ({"curves": ("z", "peano")}, "expected z, z-trans"),
         ({"sh_degree": 4}, "sh_degree is 4"),
-        ({"curves": ()}, "curves is (); expected z, z-trans"),
-        ({"grid": 1000}, "grid is 1000"),
         ({"encoder": "concat", "use_appearance": False}, "encoder 'concat' expects both on"),
         ({"norm": "group"}, "norm is 'group'; expected scene, batch"),
-        ({"patch": 0}, "patch is 0"),
-        ({"head_depth": 1}, "head_depth is 1"),
     ],
 )
 def test_contradictory_settings_are_refused_by_name(changes, message):
@@ -197,8 +189,6 @@ def test_contradictory_settings_are_refused_by_name(changes, message):
         preset("tiny", **changes)
 
 
-def test_unknown_names_are_refused():
+def test_an_unknown_size_is_refused():
     with pytest.raises(PointSplatError, match="no refiner size 'huge'; expected one of full, small, tiny"):
         preset("huge")
-    with pytest.raises(RefinerConfigError, match="unknown refiner settings color_space"):
-        RefinerConfig.from_dict({"color_space": 1})

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from making import normal_scene
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import preset
 from pointsplat_ns.refiner.structure import (
@@ -13,17 +14,6 @@ from pointsplat_ns.refiner.structure import (
     neighbour_pairs,
     unit_cube,
 )
-
-
-def test_the_cube_keeps_the_aspect_and_centres_the_scene():
-    means = torch.rand(1000, 3) * torch.tensor([6.0, 4.0, 2.0]) + torch.tensor([10.0, -3.0, 1.0])
-    cube = unit_cube(means)
-    position = cube.positions(means)
-    span = position.amax(0) - position.amin(0)
-    size = means.amax(0) - means.amin(0)
-    assert torch.allclose(cube.extent, size.max().double())
-    assert torch.allclose(span, (size / size.max()).double())
-    assert torch.allclose(position.amax(0), -position.amin(0))
 
 
 def test_one_far_outlier_at_most_doubles_the_extent():
@@ -89,11 +79,8 @@ def test_hilbert_codes_are_those_of_the_published_algorithm(bits):
     assert z.tolist() == [interleaved(point, bits) for point in coords.tolist()]
 
 
-def scene_at(means: torch.Tensor, seed: int = 0) -> Gaussians:
-    g = torch.Generator().manual_seed(seed)
-    n = len(means)
-    shapes = ((n, 3), (n, 4), (n, 1), (n, 3), (n, 3, 3))
-    return Gaussians(means, *(torch.randn(shape, generator=g) for shape in shapes))
+def scene_at(means: torch.Tensor) -> Gaussians:
+    return normal_scene(len(means)).replace(means=means)
 
 
 def surface(n: int, seed: int = 0) -> torch.Tensor:
@@ -103,23 +90,15 @@ def surface(n: int, seed: int = 0) -> torch.Tensor:
     return means
 
 
-@pytest.mark.parametrize("size", ["full", "small", "tiny"])
-def test_orders_are_permutations_at_every_level(size):
-    structure = build_structure(scene_at(surface(500)), preset(size))
-    assert structure.order.sort().values.tolist() == list(range(500))
-    assert torch.equal(structure.order[structure.inverse], torch.arange(500))
-    for level in structure.levels:
-        for order, inverse in level.orders[1:]:
-            assert torch.equal(order[inverse], torch.arange(level.size))
-
-
-def test_clusters_hold_exactly_the_points_of_a_cell():
+def test_clusters_hold_exactly_the_points_of_a_cell_and_orders_are_permutations():
     means = surface(800)
     config = preset("full", grid=64)
     structure = build_structure(scene_at(means), config)
     position = structure.cube.positions(means)[structure.order] + 0.5
     cluster = torch.arange(800)
     for level, stride in zip(structure.levels, (1, 2, 4, 8), strict=False):
+        for order, inverse in level.orders[1:]:
+            assert torch.equal(order[inverse], torch.arange(level.size))
         cluster = level.cluster[cluster]
         assert set(cluster.diff().tolist()) <= {0, 1}, "cells of a level are runs without gaps"
         cells = (position * 64 / stride).floor().clamp(max=64 // stride - 1).long()

@@ -1,12 +1,9 @@
 """Interrupted trainings, skipped steps, and numbers below the smallest normal float."""
 
 import copy
-import math
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from unittest import mock
 
 import pytest
@@ -15,6 +12,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.scripts.train import launch
 
+from broken_steps import broken
 from making import equal, small_config
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.io import open_run, read_scene
@@ -105,25 +103,6 @@ def test_no_steps_are_refused_and_leave_no_folder(number, wall_scene, wall_confi
 
 
 LOG = "pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log"
-
-
-@contextmanager
-def broken(kind: str, steps: range) -> Iterator[None]:
-    """Within, the loss of these steps is NaN, or finite with a gradient that is not."""
-    losses_of = SplatfactoCpuModel.get_loss_dict
-
-    def losses(self, *args, **kwargs):
-        found = losses_of(self, *args, **kwargs)
-        if self.step in steps:
-            # a root's slope at 0, times 0
-            found["main_loss"] = found["main_loss"] + (
-                math.nan if kind == "nan" else 0 * (0 * self.scales.sum()).sqrt()
-            )
-            assert found["main_loss"].isfinite() == (kind == "gradient")
-        return found
-
-    with mock.patch.object(SplatfactoCpuModel, "get_loss_dict", losses):
-        yield
 
 
 def state_of(trainer):
