@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from lab.rooms import light
+from pointsplat_ns import view_source
 from pointsplat_ns.compression import repair
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.settings import changed
 from quick_looking import QUICK, USUAL
 

@@ -27,12 +27,12 @@ from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.threads import suitable_threads
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import View, Views
 
 

@@ -14,11 +14,11 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, def
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.upright import Up, up_named
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views, spread_indices
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.sog_stream import coarser_levels
 from pointsplat_ns.io.runs import RUN_FILES, may_be_run, open_run, scene_name
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pages.film import PHOTO_SIDE, FilmSettings, camera_path, render_frames
 from pointsplat_ns.pages.video import check_output, write_frames
 from pointsplat_ns.system.progress import Progress, tracked
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 if TYPE_CHECKING:

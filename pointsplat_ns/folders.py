@@ -46,13 +46,13 @@ from pointsplat_ns.io.files import (
 )  # fmt: skip
 from pointsplat_ns.io.formats import format_like, format_to_write
 from pointsplat_ns.io.scene import read_scene, save_as, source_file, source_parts
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.pages.gallery import draw_pair, pair_of, write_gallery, write_sheet
 from pointsplat_ns.pruning import Keep
 from pointsplat_ns.system.progress import Progress, progress_bar
 from pointsplat_ns.system.tensors import normal_mode
 from pointsplat_ns.system.workers import Workers, check_jobs
+from pointsplat_ns.view_source import VIEW_COUNTS
 
 FIGURES = ("before", "after", "megabytes_before", "megabytes", "psnr", "seconds")
 """Numbers of a result in its record."""

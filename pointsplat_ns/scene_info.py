@@ -18,10 +18,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import SHORTEST
 from pointsplat_ns.io.scene import kind_of, read_scene, source_parts
 from pointsplat_ns.looking.upright import Up, up_named
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning.sh_bands import band_energies
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.view_source import ViewSource
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from making import cloud
 from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.view_source import ViewSource
 
 
 def test_rows_that_look_wrong_are_counted():

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pointsplat_ns.comparing.closeness import Closeness, DenseReference
 from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.view_source import ViewSource
 
 
 @dataclass(frozen=True)

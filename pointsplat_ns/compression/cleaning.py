@@ -28,12 +28,12 @@ from pointsplat_ns.geometry.neighbours import nearest
 from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.content import content_size, in_units
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.rasterizer import pixel_sums, pixels_of, render, render_depth
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import View, Views
 
 PLACES = 16

@@ -24,10 +24,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.photos.examples import Photos, mean_psnr
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.quantities import counted
+from pointsplat_ns.view_source import ViewSource
 
 
 def compact_scene(

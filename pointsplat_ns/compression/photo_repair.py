@@ -31,10 +31,10 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.photos.examples import Example, Photos, every_kth_pixel, mean_psnr
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views, spread_indices
 
 

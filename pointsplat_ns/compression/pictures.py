@@ -17,8 +17,8 @@ from pointsplat_ns.compression.quality import Quality
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.io.files import replacing
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.rasterizer import render, render_with_alpha
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views, spread_indices
 
 

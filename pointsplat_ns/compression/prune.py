@@ -22,7 +22,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.merging import Merger, merge
 from pointsplat_ns.pruning import (
     Megabytes,
@@ -35,6 +34,7 @@ from pointsplat_ns.pruning import (
 )
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.quantities import counted
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 
 
 @dataclass(frozen=True, eq=False)

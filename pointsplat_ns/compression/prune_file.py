@@ -18,7 +18,6 @@ from pointsplat_ns.io.formats import format_to_read
 from pointsplat_ns.io.ply import PlyRows, read_ply
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.merging.by_cells import merge_file
 from pointsplat_ns.merging.cells import Scratch
 from pointsplat_ns.merging.settings import MERGING
@@ -26,6 +25,7 @@ from pointsplat_ns.photos.posed_scene import PosesFile, without_poses
 from pointsplat_ns.pruning import found_by_trying
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.workers import check_jobs
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import Views
 
 
@@ -111,7 +111,7 @@ def prune_file(
         request: options of pruning.
         memory: bytes that may be taken; more than the largest cell takes change nothing.
         poses: a file of cameras; by default views are sampled.
-        resolution, up: as of :class:`~pointsplat_ns.looking.view_source.ViewSource`.
+        resolution, up: as of :class:`~pointsplat_ns.view_source.ViewSource`.
         jobs: number of processes that share the cells, each within ``memory``.
 
     Returns:

@@ -1,6 +1,6 @@
 """How close a written scene is to the dense scene: one judgement, which commands, pages and pictures say in one text.
 
-Renders are compared in the views of :meth:`~pointsplat_ns.looking.view_source.ViewSource.whole`, at the size that
+Renders are compared in the views of :meth:`~pointsplat_ns.view_source.ViewSource.whole`, at the size that
 people look at, in few of their pixels. For PSNR these are every k-th (:mod:`~pointsplat_ns.comparing.sizes`). SSIM
 needs neighbours, so it takes bands of rows of each view, at other heights in each.
 """
@@ -23,11 +23,11 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
 from pointsplat_ns.io.usable import usable_part
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
+from pointsplat_ns.view_source import ViewSource
 
 WORDS = (
     (40.0, "looks the same"),

@@ -34,10 +34,10 @@ from pointsplat_ns.levels.paged import write_paged
 from pointsplat_ns.levels.stream import write_stream
 from pointsplat_ns.levels.tiles import TILESET, placed, write_tiles
 from pointsplat_ns.looking.content import content_box
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import merge_levels
 from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
 from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 

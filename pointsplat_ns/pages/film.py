@@ -16,9 +16,9 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import Up, known_up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.pages.pictures import to_uint8, with_labels
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views
 
 MOST_FRAMES = 100_000

@@ -21,10 +21,10 @@ from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.opening import opening_views
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.looking.upright import Up, known_up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pruning import need_usable
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")

@@ -14,10 +14,10 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.usable import keep_usable
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.merging import Merger
 from pointsplat_ns.pruning import need_usable, resolve_keep, select
 from pointsplat_ns.pruning.baselines import coverage_score
+from pointsplat_ns.view_source import ViewSource
 
 
 @dataclass(eq=False)

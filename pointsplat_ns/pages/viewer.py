@@ -19,12 +19,12 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io.files import one_line
 from pointsplat_ns.io.formats import FORMATS
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.pages.flight import FLIGHT_SCRIPTS, FlightFrame
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.kept import Level, ViewedScene
 from pointsplat_ns.pages.server import Answer, Request, Route, Server
 from pointsplat_ns.system.memory import share_freed_memory
+from pointsplat_ns.view_source import VIEW_COUNTS
 
 READABLE_NAMES = (*(kind.suffix for kind in FORMATS if kind.read and kind.suffix.startswith(".")), ".pt")
 """Ends of the names of files that may be dropped."""

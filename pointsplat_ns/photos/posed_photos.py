@@ -25,13 +25,13 @@ from pointsplat_ns.io.files import bytes_text, logger, require_memory
 from pointsplat_ns.io.photos import PhotoReader, photo_files, photos_of_cameras
 from pointsplat_ns.io.scene import read_scene
 from pointsplat_ns.looking.content import thinned
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.photos.examples import Example, Photos, mean_psnr
 from pointsplat_ns.photos.frame import in_frame
 from pointsplat_ns.photos.pose_check import POSE_CHECK, likeness
 from pointsplat_ns.photos.posed_scene import without_poses
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import Views, spread_indices
 
 LEAST_PHOTOS = 8

@@ -17,13 +17,13 @@ from pointsplat_ns.compression.requests import CompactRequest, PruneRequest, Rep
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, name_of
 from pointsplat_ns.looking.upright import up_named
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import run_photos, view_source
 from pointsplat_ns.photos.examples import Photos
 from pointsplat_ns.photos.posed_photos import read_with_photos
 from pointsplat_ns.photos.posed_scene import NO_POSES, check_photos, read_found, without_poses
 from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.tradeoff.points import DENSE, EFFORTS, Setting
+from pointsplat_ns.view_source import ViewSource
 
 
 @dataclass(frozen=True, eq=False)

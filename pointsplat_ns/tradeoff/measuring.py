@@ -22,7 +22,6 @@ from pointsplat_ns.compression.quality import Judge
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.metrics import SSIM_WINDOW, ssim
 from pointsplat_ns.photos.examples import Example, Photos
 from pointsplat_ns.pruning import need_usable, ply_bytes
@@ -32,6 +31,7 @@ from pointsplat_ns.system.progress import Progress
 from pointsplat_ns.system.threads import fixed_threads, now
 from pointsplat_ns.tradeoff.making import Subject
 from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import View, Views, spread_indices
 
 ROUNDS = 3

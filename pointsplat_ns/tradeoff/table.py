@@ -15,7 +15,6 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.files import bytes_text, need_folder, replacing, three_digits
 from pointsplat_ns.io.runs import name_of
-from pointsplat_ns.looking.view_source import VIEW_COUNTS
 from pointsplat_ns.nerfstudio_plugin.dataset_views import need_named_data
 from pointsplat_ns.pages.html import page
 from pointsplat_ns.pages.pictures import picture_uri, to_uint8
@@ -36,6 +35,7 @@ from pointsplat_ns.tradeoff.points import (
     write_points,
 )
 from pointsplat_ns.tradeoff.recommend import next_best, recommend
+from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import spread_indices
 
 

@@ -132,9 +132,7 @@ def test_without_options_two_commands_come_next(psnr, other, tmp_path, monkeypat
     assert "next: " not in capsys.readouterr().out
 
 
-def test_what_cannot_be_used_is_refused_in_one_line_before_anything_takes_long(
-    ply, helps, tmp_path, capsys, monkeypatch
-):
+def test_what_cannot_be_used_is_refused_in_one_line_and_early(ply, helps, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pointsplat_ns.compression.compact.prune_scene", None)  # a call of it would be no error of ours
     save_refiner(Refiner(preset("tiny", sh_degree=0)), tmp_path / "flat.safetensors")
     shown = tmp_path / "shown"

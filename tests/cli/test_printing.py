@@ -10,9 +10,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, box_room
+from pointsplat_ns import view_source
 from pointsplat_ns.cli import main
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 
 COUNT = 60

@@ -146,7 +146,7 @@ def pruned(folder: Path, *words: object, killed_at: int = 0) -> tuple[int, str]:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills processes")
-def test_processes_that_share_a_scene_write_the_bytes_of_one_also_after_a_kill(tmp_path):
+def test_several_processes_write_the_bytes_of_one_also_after_a_kill(tmp_path):
     write_ply(normal_scene(600, degree=1, seed=3), tmp_path / "scene.ply")
     parts = ("--memory", "50kB", "-o")
     status, said = pruned(tmp_path, *parts, "alone.ply")

@@ -17,8 +17,8 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import WithinPsnr, resolve_keep
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 pytestmark = pytest.mark.usefixtures("usual_looking")

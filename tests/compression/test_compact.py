@@ -19,10 +19,10 @@ from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import PruneSettings, prune
 from pointsplat_ns.refiner import Refiner, RefinerConfig
 from pointsplat_ns.system.progress import silent
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 TINY = {"enc_channels": (8, 8), "enc_depths": (1, 1), "enc_heads": (1, 1), "strides": (2,), "patch": 64}

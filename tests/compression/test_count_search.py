@@ -22,8 +22,8 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats import Format, format_to_write
 from pointsplat_ns.io.formats.rounding import rounding_for
 from pointsplat_ns.io.formats.spz import encode_spz
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, WithinPsnr, score_of, select
+from pointsplat_ns.view_source import ViewSource
 
 MOST = 100_000
 

@@ -11,9 +11,9 @@ from pointsplat_ns.compression.requests import PruneRequest
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pruning import METHODS, Keep, WithinPsnr, select
 from pointsplat_ns.system.progress import silent
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 

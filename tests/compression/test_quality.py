@@ -12,7 +12,7 @@ from pointsplat_ns.comparing.fill import fill
 from pointsplat_ns.compression.quality import Judge, PhotoGain, Quality, judge_of, quality_of_file, through_file
 from pointsplat_ns.io import save
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.view_source import ViewSource
 
 SOME = Quality(28.84, 24.2, 0.9132, 12, 1920, 1080, "given views", 33.84, 12.06)
 

@@ -16,11 +16,11 @@ from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import changed
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from quick_looking import USUAL
 
 

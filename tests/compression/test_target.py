@@ -8,14 +8,14 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room
+from pointsplat_ns import view_source
 from pointsplat_ns.compression import compact
 from pointsplat_ns.compression.quality import Judge, decibels, quality_of_file, through_file
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.io.files import bytes_text
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import ViewSource
+from pointsplat_ns.view_source import ViewSource
 
 
 @pytest.fixture(scope="module")

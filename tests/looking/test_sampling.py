@@ -42,7 +42,7 @@ def test_sampled_poses_are_rotations_and_show_the_scene(hollow_ball):
      ("quats", 0.0), ("quats", 3e38), ("means", 3e38), ("means", 1e-40), ("features_dc", 3e38),
      ("features_rest", 3e38)],
 )  # fmt: skip
-def test_some_extreme_gaussians_leave_views_and_likelihoods_that_are_finite(hollow_ball, name, value):
+def test_some_extreme_gaussians_leave_views_and_likelihoods_finite(hollow_ball, name, value):
     scene = hollow_ball.map(lambda tensor: tensor.clone())
     getattr(scene, name)[:: 2 if name == "scales" else 20] = value
     sampler = Sampler(scene, (48, 36))

@@ -13,9 +13,9 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoTraces, correlation, trace_factors
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 from pointsplat_ns.pruning import cut_sh
+from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
 

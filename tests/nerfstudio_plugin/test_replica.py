@@ -179,7 +179,7 @@ def test_seed_points_avoid_outlines_and_unknown_pixels(tmp_path):
 
 
 @pytest.mark.parametrize("lost", ["-inf " * 16, "nan " * 12 + "0 0 0 1", "1 0 0 1e39 0 1 0 0 0 0 1 0 0 0 0 1"])
-def test_lost_poses_and_those_beyond_float32_are_dropped_and_their_lines_said(scene, caplog, lost):
+def test_lost_poses_and_those_beyond_float32_are_dropped_by_line(scene, caplog, lost):
     edit_line(scene, 2, lost)
     with caplog.at_level(logging.WARNING):
         loaded = load_replica(scene)

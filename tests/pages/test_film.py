@@ -12,10 +12,10 @@ from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.looking.opening import Opening
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.upright import Up
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import film
 from pointsplat_ns.pages.film import FilmSettings, along, fitted, toured
 from pointsplat_ns.pages.pictures import with_labels
+from pointsplat_ns.view_source import ViewSource
 
 
 def views_at(eyes: torch.Tensor, targets: torch.Tensor, up: torch.Tensor | None = None) -> ps.Views:

@@ -9,9 +9,9 @@ import torch
 
 import pointsplat_ns as ps
 from making import ball, same
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.pages import kept as module
 from pointsplat_ns.pages.kept import ViewedScene
+from pointsplat_ns.view_source import ViewSource
 
 
 @pytest.fixture(scope="module")

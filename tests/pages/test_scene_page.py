@@ -35,7 +35,7 @@ def scenes_in(path: Path, folder: Path) -> list[Gaussians]:
     return scenes
 
 
-def test_page_names_nothing_outside_of_itself_and_lets_only_its_own_scripts_run(written):
+def test_page_names_nothing_outside_and_runs_only_its_own_scripts(written):
     names_nothing_outside(written)
     parts = parts_of(written)
     assert policy_of(parts) == {
@@ -106,7 +106,7 @@ def test_what_is_very_far_away_or_has_no_meaning_is_left_out_and_counted(tmp_pat
     assert len(shown) == 197 and shown.means.abs().max() < 2047
 
 
-def test_flight_begins_with_the_whole_and_leads_to_the_views_that_were_given():
+def test_flight_begins_with_the_whole_and_leads_to_given_views():
     scene = ball(300)
     K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 20.0], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
     viewmats = look_at(torch.tensor([[6.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), torch.tensor([[12.0, 0.0, 0.0], [0.0] * 3]))

@@ -78,9 +78,7 @@ def test_poses_are_found_where_projects_have_them(kind, scene, views, tmp_path, 
 
 
 @pytest.mark.parametrize("axes", [True, False])
-def test_turned_axes_of_the_world_and_of_cameras_or_another_scale_are_found_and_named(
-    axes, scene, views, tmp_path, said
-):
+def test_turned_axes_and_other_scales_of_poses_are_found_and_named(axes, scene, views, tmp_path, said):
     folder = write_photos(scene, views, tmp_path / "images")
     poses = invert_rigid(views.viewmats.double())
     poses[:, :3] = UP.double() @ poses[:, :3] if axes else poses[:, :3] * poses.new_tensor([1.0, 1.0, 1.0, 0.4])

@@ -90,7 +90,7 @@ def surface(n: int, seed: int = 0) -> torch.Tensor:
     return means
 
 
-def test_clusters_hold_exactly_the_points_of_a_cell_and_orders_are_permutations():
+def test_clusters_hold_the_points_of_a_cell_and_orders_are_permutations():
     means = surface(800)
     config = preset("full", grid=64)
     structure = build_structure(scene_at(means), config)

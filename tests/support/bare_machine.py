@@ -43,7 +43,7 @@ def outcome(words: list[str]) -> dict:
 
 if __name__ == "__main__":
     sys.addaudithook(no_network)
-    from pointsplat_ns.looking import view_source
+    from pointsplat_ns import view_source
 
     view_source.RESOLUTION = (64, 48)
     with changed(QUICK):

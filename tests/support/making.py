@@ -17,8 +17,8 @@ import torch
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.looking.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -7,8 +7,8 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room
+from pointsplat_ns import view_source
 from pointsplat_ns.compression import repair
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.tradeoff.points import Tradeoff
 from pointsplat_ns.views import Views

@@ -14,12 +14,11 @@ import torch
 
 import pointsplat_ns as ps
 from making import same_bits
+from pointsplat_ns import view_source
 from pointsplat_ns.cli import main
 from pointsplat_ns.compression import compact, repair
 from pointsplat_ns.compression.repair import Repaired
 from pointsplat_ns.errors import DataError, PointSplatError, SceneError
-from pointsplat_ns.looking import view_source
-from pointsplat_ns.looking.view_source import ViewSource
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.tradeoff import measuring, table
@@ -28,6 +27,7 @@ from pointsplat_ns.tradeoff.measuring import views_to_judge
 from pointsplat_ns.tradeoff.points import DENSE, Setting
 from pointsplat_ns.tradeoff.recommend import PHOTO_PSNR, expected_loss, fastest_within, recommend
 from pointsplat_ns.tradeoff.table import settings_of
+from pointsplat_ns.view_source import ViewSource
 from trades import POINTS, point
 
 
@@ -178,7 +178,7 @@ def test_without_photos_the_loss_is_that_expected_of_renders(db, key):
     assert fastest_within(without, expected_loss(db)).key == key
 
 
-def test_of_two_as_fast_the_smaller_is_recommended_and_where_times_mean_nothing_the_fewest_gaussians():
+def test_of_two_as_fast_the_smaller_is_recommended():
     twin = replace(POINTS[3], key="twin", bytes=20)
     assert fastest_within([*POINTS, twin], 0.5).key == "twin"
     slow = replace(POINTS[1], key="few", frame_ms=1e6, gaussians=1)

@@ -11,8 +11,8 @@ from lab.tables import layout
 from lab.tables.cells import Tables
 from lab.tables.measure import measure_tables
 from making import box_room
+from pointsplat_ns import view_source
 from pointsplat_ns.compression import repair
-from pointsplat_ns.looking import view_source
 from pointsplat_ns.refiner import Refiner, preset
 from pointsplat_ns.refiner.weights import save_refiner
 

@@ -20,7 +20,6 @@ PRESETS = {"paper": paper_config, "authors": authors_config}
 
 # The paper's text and what is known of the released code, read independently of presets.py.
 FIELDS = {
-    "method_name": ("pointsplat-paper", "pointsplat-authors"),
     "max_num_iterations": (10_000, 10_000),
     "schedule": ("step", "step"),
     "drop_at": (0.6, 0.7),
