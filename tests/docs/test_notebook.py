@@ -13,7 +13,8 @@ SMALLER = f"""
 import pointsplat_ns as ps
 from pointsplat_ns import api
 from pointsplat_ns.compression import repair
-from pointsplat_ns.looking import settings, view_source
+from pointsplat_ns import view_source
+from pointsplat_ns.looking import settings
 
 ps.save(ps.example_room()[::30], "room.ply")
 api.EXAMPLE, repair.STEPS["quick"], view_source.RESOLUTION = "room.ply", 2, (64, 48)
