@@ -141,7 +141,7 @@ class Sampler:
     @cached_property
     def up(self) -> Up:
         """Which way is up."""
-        return self._up or upright(self.few, self.surface, self.traced)
+        return self._up or upright(thinned(self._in_units, 20_000), self.surface, self.traced)
 
     @cached_property
     def few(self) -> Gaussians:

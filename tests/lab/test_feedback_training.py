@@ -22,7 +22,6 @@ def small(hollow_ball) -> Iterator[TrainingScene]:
 
 
 def test_training_brings_repairs_closer(small, tmp_path):
-    """The same repairs before and after."""
 
     def reached(network: FeedbackRefiner) -> float:
         with torch.no_grad():

@@ -98,7 +98,6 @@ def extreme_scenes() -> dict[str, Gaussians]:
 @pytest.mark.parametrize("k", [1, 20])
 @pytest.mark.parametrize("name", list(extreme_scenes()))
 def test_extremes_give_k_drawable_gaussians(name, k):
-    """Without views, and with one that shows some of it."""
     scene = extreme_scenes()[name]
     merged = merge(scene, k, views=views_from_within((-2.0, 0.5, 0.5), 1, 64, 64) if k == 20 else None).scene
     assert len(merged) == k and merged.dtype == scene.dtype

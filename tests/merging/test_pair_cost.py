@@ -98,7 +98,6 @@ def extremes(n: int) -> Gaussians:
 
 @compiled_or_not
 def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
-    """Each Gaussian with the next ones."""
     state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(8)) % 200
     costs = pair_costs(state, others.to(torch.int32), compiled=compiled)
     assert bool(costs.isfinite().all()) and bool((costs >= 0).all())

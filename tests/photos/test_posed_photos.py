@@ -104,7 +104,6 @@ def test_a_scene_in_the_frame_of_nerfstudio_needs_no_file_that_says_so(scene, vi
 
 
 def test_applied_and_dataparser_transforms_that_a_scene_lacks_are_undone(scene, views, tmp_path, said):
-    """Each is a turn that is no turn of axes."""
     folder = write_photos(scene, views, tmp_path / "images")
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]])

@@ -105,7 +105,6 @@ def written(monkeypatch, tmp_path):
     [("room0", "", ""), ("410c470782", "", ""), ("room0", "replica", ""), ("room0", "Replica", "10 of 200 photos")],
 )
 def test_the_papers_figures_never_stand_beside_another_dataset_or_protocol(written, name, dataset, differs):
-    """Whatever scenes and groups are called."""
     tables = add_scene(Tables(), name, "Replica", dataset, differs=differs)
     files = written(tables)
     assert not [column for table in tables_of(tables) for column in table.header if "paper" in column]
