@@ -88,34 +88,28 @@ def read(path: Path) -> Tables:
 
 
 def shortened(table: Table) -> Table:
-    """A table without rows that were not measured, notes, :data:`LEFT_OUT` and :data:`LOSS`, with PSNR and LPIPS in one
-    cell, and a method's shares or lambdas side by side."""
+    """A table without rows that were not measured, notes and :data:`LEFT_OUT`, with PSNR and LPIPS in one cell: Table 4
+    with the parts of each model and the spread; the others with a method's shares or lambdas side by side, and Table 1
+    with what each was made with, but for :data:`LOSS`."""
     rows = [dict(zip(table.header, row, strict=True)) for row in table.rows if "not measured" not in row]
     parts = [name for name in table.header if name not in (*LEFT_OUT, "PSNR", "LPIPS", "made with")]
-    spreads = [f" ± {row['spread']}" if row.get("spread", "-") != "-" else "" for row in rows]
-    found = {
-        tuple(row[name] for name in parts): f"{row['PSNR']}{spread}, {row['LPIPS']}"
-        for row, spread in zip(rows, spreads, strict=True)
-    }
-    made = {tuple(row[name] for name in parts): row["made with"].removesuffix(LOSS) for row in rows}
     if table.number == 4:
-        used = {
-            words: ", ".join(part for part, has in zip(parts[1:], words[1:], strict=True) if has) for words in found
-        }
-        lines = [(words[0], used[words], cell) for words, cell in found.items()]
-        return dataclasses.replace(table, header=("model", "parts", "PSNR, LPIPS"), rows=lines, notes=[])
+        header, lines = ["model", "parts", "PSNR, LPIPS"], []
+        for row in rows:
+            spread = "" if row["spread"] == "-" else f" ± {row['spread']}"
+            used = ", ".join(name for name in parts[1:] if row[name])
+            lines.append([row["model"], used, f"{row['PSNR']}{spread}, {row['LPIPS']}"])
+        return dataclasses.replace(table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[])
+    found = {tuple(row[name] for name in parts): row for row in rows}
     columns, methods = (list(dict.fromkeys(words[place] for words in found)) for place in (0, 1))
-    lines = [
-        (
-            method,
-            *(found.get((column, method), "-") for column in columns),
-            "; ".join(dict.fromkeys(made[column, method] for column in columns if (column, method) in made)),
-        )
-        for method in methods
-    ]
-    kept = len(columns) + (2 if table.number == 1 else 1)  # networks of Table 3 are made like those of Table 1
-    header = (parts[1], *columns, "made with")
-    return dataclasses.replace(table, header=header[:kept], rows=[line[:kept] for line in lines], notes=[])
+    header, lines = [parts[1], *columns], []
+    for method in methods:
+        own = {column: found[column, method] for column in columns if (column, method) in found}
+        lines.append([method, *(f"{own[c]['PSNR']}, {own[c]['LPIPS']}" if c in own else "-" for c in columns)])
+        if table.number == 1:  # networks of Table 3 are made like these
+            lines[-1].append("; ".join(dict.fromkeys(row["made with"].removesuffix(LOSS) for row in own.values())))
+    header += ["made with"] * (table.number == 1)
+    return dataclasses.replace(table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[])
 
 
 def page(tables: Tables, encoders: Path) -> str:
