@@ -131,7 +131,7 @@ def fine_tuned(small: Gaussians, dense: Gaussians, scene: OpenedScene, steps: in
             for index in reversed(order.sample(range(len(views)), len(views))):
                 yield Example(views[index], targets[index].to(small.means))
 
-    scenes = optimised(small, Adam(small, AdamSettings(), RATES), examples())
+    scenes = optimised(small, Adam(small, AdamSettings(), RATES), examples(), pixel_loss="l1")
     return next(itertools.islice(scenes, steps - 1, None))
 
 

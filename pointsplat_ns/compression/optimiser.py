@@ -1,6 +1,8 @@
 """Optimises the parameters of a scene by Adam, so that its renders match target images.
 
-The loss of a view is that of 3DGS: 0.8 L1 + 0.2 (1 - SSIM).
+The loss of a view is 0.8 RMSE + 0.2 (1 - SSIM). With L1 in place of the root mean squared error, as 3DGS has it, a
+tenth that is trained on photos has 0.16 dB less in held-out photos, at equal LPIPS (fox, figure, ray, drone_hall), and
+a repair has 0.09 dB less (three splats at 3 to 50 %).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.metrics import SSIM_WINDOW
+from pointsplat_ns.metrics import PIXEL_LOSSES, SSIM_WINDOW, PixelLoss
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
@@ -116,6 +118,7 @@ def optimised(
     adam: Adam,
     examples: Iterator[Example],
     choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
+    pixel_loss: PixelLoss = "rmse",
 ) -> Iterator[Gaussians]:
     """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
     of a flat axis) do not change.
@@ -126,11 +129,12 @@ def optimised(
         examples: views and their target images, without end.
         choose: from the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`. It is
             called after the gradients of the step are computed.
+        pixel_loss: "l1" for the loss of 3DGS.
     """
     scene = scene.detach()
     while True:
         with suitable_threads(scene.device):
-            adam.observe(gradients_of(scene, *next(examples)))
+            adam.observe(gradients_of(scene, *next(examples), pixel_loss=pixel_loss))
             scene = adam.moved(scene, *choose(scene))
         yield scene
 
@@ -167,6 +171,7 @@ def gradients_of(
     target: Tensor,
     mask: Tensor | None = None,
     backend: Literal["torch", "auto"] = "torch",
+    pixel_loss: PixelLoss = "rmse",
 ) -> dict[str, Tensor]:
     """Gradients of the loss of one view by parameter. A gradient is 0 where it or the value itself is not finite.
 
@@ -176,11 +181,12 @@ def gradients_of(
         target: (H, W, 3) target image in [0, 1].
         mask: (H, W, 1) bool, the pixels that count; None for all.
         backend: the rasterizer, as for :func:`pointsplat_ns.rasterizer.render`.
+        pixel_loss: as for :func:`optimised`.
     """
     leaves = scene.map(lambda value: value.detach().requires_grad_())
     with torch.enable_grad():
         image = render(leaves, view, backend=backend)
-        _loss(*Example(view, target, mask).compared(image)).backward()
+        _loss(*Example(view, target, mask).compared(image), pixel_loss).backward()
     gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in leaves.items()}
     # Sums are finite where all numbers are, nearly always, and take a tenth of the time of looking at each.
     sums = torch.stack([value.detach().sum() for value in (*leaves.tensors(), *gradients.values())])
@@ -197,10 +203,10 @@ def nonzero_rms(gradient: Tensor) -> float:
         return float(nonzero.square().mean().sqrt()) if nonzero.numel() else 0.0
 
 
-def _loss(image: Tensor, target: Tensor) -> Tensor:
-    """The loss of 3DGS for an image (H, W, 3); L1 alone for images smaller than SSIM's window."""
-    l1 = (image - target).abs().mean()
+def _loss(image: Tensor, target: Tensor, pixel_loss: PixelLoss) -> Tensor:
+    """The loss of an image (H, W, 3); without SSIM for images smaller than its window."""
+    pixels = PIXEL_LOSSES[pixel_loss](image - target)
     if min(image.shape[:2]) < SSIM_WINDOW:
-        return l1
+        return pixels
     similarity = mean_ssim(image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])
-    return 0.8 * l1 + 0.2 * (1 - similarity)
+    return 0.8 * pixels + 0.2 * (1 - similarity)

@@ -1,9 +1,8 @@
 """Optimises a repaired scene against the photos that the dense scene was trained on.
 
 A repair against renders of the dense scene cannot be better than these. Photos hold more. Each step takes every k-th
-pixel of a photo and a step of Adam on 0.8 L1 + 0.2 (1 - SSIM), as the training of 3DGS does. Few pixels allow many
-steps. Every eighth step takes a render of the dense scene in a view that no photo has, which holds the parts that
-photos show little of.
+pixel of a photo and a step of Adam on 0.8 RMSE + 0.2 (1 - SSIM). Few pixels allow many steps. Every eighth step takes a
+render of the dense scene in a view that no photo has, which holds the parts that photos show little of.
 
 Photos of the steps say whether the result is better. The dense scene was trained on them, too: both scenes know them.
 Every eighth photo takes part in no step. The dense scene knows these better than the result does, so they fall by more

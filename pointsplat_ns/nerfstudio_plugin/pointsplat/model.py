@@ -6,7 +6,6 @@ To nerfstudio's viewer and exporter it is a Splatfacto model, whose Gaussians ar
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -23,7 +22,7 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import viewmats_from_opengl
 from pointsplat_ns.io.pictures import in_unit_range
-from pointsplat_ns.metrics import ImageError, psnr
+from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, PixelLoss, psnr
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, cached_lpips
 from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions, carried, need_pinhole
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene
@@ -33,13 +32,6 @@ from pointsplat_ns.refiner.augmentation import random_transform
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManager
-
-PIXEL_LOSSES: dict[str, Callable[[Tensor], Tensor]] = {
-    "l1": lambda difference: difference.abs().mean(),
-    # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
-    "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
-}
-"""Pixel losses by name, as functions of the difference (H, W, 3) of two images."""
 
 
 @dataclass
@@ -83,7 +75,7 @@ class PointSplatModelConfig(RasterizerOptions, ModelConfig):
     """Largest move of a mean along an axis, as a share of the scene's extent (the authors' code: 1)."""
     train_encoder: bool = True
     """Train the encoder. The authors' code leaves it at its random weights."""
-    pixel_loss: Literal["l1", "rmse"] = "l1"
+    pixel_loss: PixelLoss = "l1"
     """Pixel loss: mean absolute difference, or root mean squared difference, which determines the PSNR."""
     lpips_weight: float = 0.1
     """Weight of LPIPS in the loss; the pixel loss has weight 1."""

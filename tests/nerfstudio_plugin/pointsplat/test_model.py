@@ -21,9 +21,9 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.gaussians import PARAMETERS
 from pointsplat_ns.io import read_ply
 from pointsplat_ns.io.runs import open_run
+from pointsplat_ns.metrics import PIXEL_LOSSES
 from pointsplat_ns.metrics.lpips import LpipsUnavailable, load_lpips
 from pointsplat_ns.nerfstudio_plugin.pointsplat.evaluation import VARIANTS, print_summary
-from pointsplat_ns.nerfstudio_plugin.pointsplat.model import PIXEL_LOSSES
 from pointsplat_ns.pruning import METHODS, score_of, select
 from pointsplat_ns.rasterizer import rasterization
 
