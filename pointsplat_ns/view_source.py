@@ -9,7 +9,7 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
-from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, two_sizes
+from pointsplat_ns.comparing.sizes import RESOLUTION, SMALLEST_SIDE, middle_sized, two_sizes
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
@@ -149,7 +149,9 @@ class ViewSource:
         """At most ``count`` views for scores, of the size of :meth:`compared`."""
         return middle_sized(self.views(count))
 
-    def others(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
+    def others(
+        self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
+    ) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
         is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
         (:func:`~pointsplat_ns.comparing.sizes.two_sizes`), the next time the other way around.
@@ -160,6 +162,7 @@ class ViewSource:
         Args:
             seed: seed of the order, and of sampled views.
             count: number of different sampled views.
+            drawn_side: longer side of what is drawn of a picture, pixels.
 
         Raises:
             DataError: if none can be sampled.
@@ -168,28 +171,30 @@ class ViewSource:
         every = 0 if known is None else len(known)
         left = sorted(set(range(every)) - set(spread_indices(every, VIEW_COUNTS.compared)))
         if known is None or not left:
-            yield from self.sampled(seed, count)
+            yield from self.sampled(seed, count, drawn_side)
             return
-        others = _in_turn(self._at_resolution(known)[left], seed)
+        others = _in_turn(self._at_resolution(known)[left], seed, drawn_side)
         if len(left) > len(compared):
             yield from others
         else:
-            for pair in zip(others, self.sampled(seed, count), strict=False):  # neither ends
+            for pair in zip(others, self.sampled(seed, count, drawn_side), strict=False):  # neither ends
                 yield from pair
 
-    def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped) -> Iterator[View]:
+    def sampled(
+        self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
+    ) -> Iterator[View]:
         """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the arguments."""
         compared, views = self.compared(), self.sampler.views(count, seed + 1)
         views = replace(views, background=compared.background, rasterize_mode=compared.rasterize_mode)
-        for turn, view in enumerate(_in_turn(views, seed)):
+        for turn, view in enumerate(_in_turn(views, seed, drawn_side)):
             opposite = self._known is None and turn % 5 == 4  # the viewer's background is unknown
             yield replace(view, background=1 - view.background) if opposite else view
 
 
-def _in_turn(views: Views, seed: int) -> Iterator[View]:
+def _in_turn(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
     """Views in random order, each once before any is repeated, then of the other size; without end. A view that comes
     again is the same object."""
-    sizes, generator = [[*of_size] for of_size in two_sizes(views)], random.Random(seed)
+    sizes, generator = [[*of_size] for of_size in two_sizes(views, drawn_side)], random.Random(seed)
     for lap in counted():
         for index in generator.sample(range(len(views)), len(views)):
             yield sizes[(lap + index) % 2][index]

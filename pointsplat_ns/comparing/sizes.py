@@ -87,10 +87,11 @@ def subsampled(views: Views, side: int, drawn_side: int | None = None) -> Views:
     return replace(drawn, eps2d=views.eps2d * (max(drawn.width, drawn.height) / side) ** 2)
 
 
-def two_sizes(views: Views) -> tuple[Views, Views]:
+def two_sizes(views: Views, drawn_side: int = SMALLEST_SIDE) -> tuple[Views, Views]:
     """Views to optimise on, of two sizes: subsampled from pictures of their :func:`middle_side`, and from whole ones.
-    Drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
-    return subsampled(views, middle_side(views)), subsampled(views, max(views.width, views.height))
+    By default, drawn pictures are no larger than the smallest: many views teach more than many pixels of few."""
+    middle, whole = middle_side(views), max(views.width, views.height)
+    return subsampled(views, middle, min(middle, drawn_side)), subsampled(views, whole, min(whole, drawn_side))
 
 
 class RendersOfSizes:

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pointsplat_ns.comparing.sizes import SMALLEST_SIDE
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import optimised
 from pointsplat_ns.compression.requests import STEPS, Effort, RepairBudget
@@ -82,7 +83,7 @@ def repair(
                 factors = network(feedback.features(scene, run.done, expected))
         return first_factor * rate_factor(run.done), factors
 
-    examples = _examples(dense, views, round(budget.growth * VIEW_COUNTS.stepped))
+    examples = _examples(dense, views, budget.growth)
     last = run.take(scene, optimised(scene, feedback, examples, choose), progress)
     return Repaired(last, run.count, run.seconds, run.interrupted)
 
@@ -128,16 +129,18 @@ class OptimisationRun:
         return scene
 
 
-def _examples(dense: Gaussians, views: ViewSource, count: int) -> Iterator[Example]:
-    """Views, of which ``count`` are sampled, and renders of the dense scene in them, without end. A view that comes
-    again is not drawn again, as long as it is among the last 256."""
+def _examples(dense: Gaussians, views: ViewSource, growth: float) -> Iterator[Example]:
+    """Views, and renders of the dense scene in them, without end; for ``growth`` times the steps, so many times the
+    sampled views and pixels: a large scene has more Gaussians between the pixels, and its projection takes most of the
+    time. A view that comes again is not drawn again, as long as it is among the last 256."""
+    count, side = round(growth * VIEW_COUNTS.stepped), round(math.sqrt(growth) * SMALLEST_SIDE)
 
-    @functools.lru_cache(maxsize=256)  # of 0.7 MB each where pictures are 16 to 9
+    @functools.lru_cache(maxsize=256)  # of 0.7 MB each where pictures are 16 to 9, to 2.8 MB in large scenes
     def drawn(view: View) -> Tensor:
         with torch.no_grad():
             return render(dense, view)
 
-    return (Example(view, drawn(view)) for view in views.others(count=count))
+    return (Example(view, drawn(view)) for view in views.others(count=count, drawn_side=side))
 
 
 def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:

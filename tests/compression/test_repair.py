@@ -52,18 +52,18 @@ def test_repair_comes_closer_in_views_that_it_has_not_seen(hollow_ball, pruned, 
     assert shares == pytest.approx([(i + 1) / STEPS["quick"] for i in range(STEPS["quick"])])
 
 
-def test_repairs_of_many_gaussians_take_more_steps_in_more_views(hollow_ball, pruned, monkeypatch):
+def test_repairs_of_many_gaussians_take_more_steps_views_and_pixels(hollow_ball, pruned, monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 4)
     monkeypatch.setattr(requests, "FEW", 75)
     asked = []
 
     class Counted(FewViews):
-        def others(self, seed=0, count=0):
-            asked.append(count)
+        def others(self, seed=0, count=0, drawn_side=0):
+            asked.append((count, drawn_side))
             return self.sampled(seed)
 
     repaired = repair(pruned, hollow_ball, Counted(hollow_ball), RepairBudget("quick"), network=None)
-    assert repaired.steps == 8 and asked == [2 * VIEW_COUNTS.stepped]
+    assert repaired.steps == 8 and asked == [(2 * VIEW_COUNTS.stepped, 453)]
 
 
 def test_learned_steps_come_closer_than_those_of_adam(monkeypatch):
