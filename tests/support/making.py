@@ -285,7 +285,7 @@ def decoded(path: Path) -> list[np.ndarray]:
 class FewViews(ViewSource):
     """Fresh views of 48 x 36 pixels."""
 
-    def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped):
+    def sampled(self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = 320):
         for number in itertools.count(1):
             yield from sample_views(self._scene, 8, 48, 36, seed=number)
 
