@@ -12,20 +12,24 @@ import tyro
 from PIL import Image
 
 from lab.common.printing import start
+from pointsplat_ns.nerfstudio_plugin.replica.layout import load_replica, read_depth
 
 
 def main(dslr: tyro.conf.Positional[Path], nice: tyro.conf.Positional[Path], to: tyro.conf.Positional[Path]) -> None:
     """Write folders that ``scannetpp-seeded`` reads, and ``semantic/Sequence_1`` for ``replica-data``, to a new folder,
     of a scene of ScanNet++ (``dslr/``) and one of Replica as NICE-SLAM lays it out."""
     meta = json.loads((dslr / "dslr/nerfstudio/transforms.json").read_text("utf-8"))
-    train, test, plain = meta["frames"], meta.pop("test_frames"), "nerfstudio/transforms.json"
-    lists = {name: [frame["file_path"] for frame in frames] for name, frames in (("train", train), ("test", test))}
-    straight = meta | {"test_frames": test, "camera_model": "PINHOLE"} | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    listed = {**meta, "frames": meta["frames"] + meta["test_frames"]}
+    del listed["test_frames"]
+    lists = {
+        part: [each["file_path"] for each in meta[key]] for part, key in (("train", "frames"), ("test", "test_frames"))
+    }
+    straight = {**meta, "camera_model": "PINHOLE", **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)}
     for name, content, folder, transforms in (
-        ("hidden", meta | {"test_frames": test}, "dslr/resized_images", f"dslr/{plain}"),
-        ("lists", meta | {"frames": train + test}, "dslr/resized_images", f"dslr/{plain}"),
+        ("hidden", meta, "dslr/resized_images", "dslr/nerfstudio/transforms.json"),
+        ("lists", listed, "dslr/resized_images", "dslr/nerfstudio/transforms.json"),
         ("undistorted", straight, "dslr/undistorted_images", "dslr/nerfstudio/transforms_undistorted.json"),
-        ("iphone", meta | {"test_frames": test}, "iphone/rgb", f"iphone/{plain}"),
+        ("iphone", meta, "iphone/rgb", "iphone/nerfstudio/transforms.json"),
     ):
         shutil.copytree(dslr / "dslr/resized_images", to / name / folder)
         (to / name / transforms).parent.mkdir()
@@ -33,15 +37,15 @@ def main(dslr: tyro.conf.Positional[Path], nice: tyro.conf.Positional[Path], to:
     for file in lists["test"]:
         (to / "hidden/dslr/resized_images" / file).unlink()
     (to / "lists/dslr/train_test_lists.json").write_text(json.dumps(lists))
-    camera = json.loads((nice.parent / "cam_params.json").read_text("utf-8"))["camera"]
-    sequence = to / "semantic/Sequence_1"
-    for kind, names in (("rgb", "frame*"), ("depth", "depth*")):
+    replica, sequence = load_replica(nice), to / "semantic/Sequence_1"
+    for kind in ("rgb", "depth"):
         (sequence / kind).mkdir(parents=True)
-        for number, path in enumerate(sorted((nice / "results").glob(names))):
-            values = np.asarray(Image.open(path))
-            values = values if kind == "rgb" else (values * (1000 / camera["scale"])).astype(np.uint16)
-            Image.fromarray(values).save(sequence / kind / f"{kind}_{number}.png")
+    for number, (photo, depth) in enumerate(zip(replica.photos, replica.depths, strict=True)):
+        Image.open(photo).save(sequence / f"rgb/rgb_{number}.png")
+        millimetres = np.round(1000 * read_depth(depth, replica.params)).astype(np.uint16)
+        Image.fromarray(millimetres).save(sequence / f"depth/depth_{number}.png")
     shutil.copy(nice / "traj.txt", sequence / "traj_w_c.txt")
+    camera = json.loads((nice.parent / "cam_params.json").read_text("utf-8"))["camera"]
     (sequence / "cam_params.json").write_text(json.dumps({"camera": camera | {"scale": 1000.0}}))
 
 
