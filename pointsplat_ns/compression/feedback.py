@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.system.threads import in_threads, one_thread_each
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,23 @@ class Feedback(Adam):
         self._visibility.lerp_(visible.to(self._visibility), 1 - self._settings.betas[1])
 
     @torch.no_grad()
-    def features(self, scene: Gaussians, done: float, steps: int) -> Tensor:
+    def factors(self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int) -> Tensor:
+        """Factors (K, 6) of the steps that a network makes of :meth:`features`, which has the other arguments. It gets
+        pieces that stay in a core's cache, each on one thread: the result is the same on any number of threads."""
+        found = scene.means.new_empty(len(scene), len(PARAMETERS))
+
+        def fill(first: int) -> None:
+            rows = slice(first, first + size)
+            with torch.no_grad():  # of this thread
+                found[rows] = network(self.features(scene, done, steps, rows)).to(found)
+
+        size = 1 << 12 if scene.device.type == "cpu" else max(len(scene), 1)
+        with one_thread_each():
+            in_threads(fill, range(0, len(scene), size), scene.device)
+        return found
+
+    @torch.no_grad()
+    def features(self, scene: Gaussians, done: float, steps: int, rows: slice = slice(None)) -> Tensor:
         """Features of each Gaussian, of order 1.
 
         - for each parameter, over its components: logarithm of the root mean square gradient in units of the damping;
@@ -75,38 +93,40 @@ class Feedback(Adam):
             scene: K Gaussians before the step.
             done: share of the steps done, in [0, 1].
             steps: number of all steps.
+            rows: the Gaussians to compute them for; all by default.
 
         Returns:
             (K, 39) float32, finite.
         """
+        scales, opacities, colours = (values[rows] for values in (scene.scales, scene.opacities, scene.features_dc))
         columns: list[Tensor] = []
         least = 1e-3  # share of the damping that is added to denominators
         for name in PARAMETERS:
             if self._first[name].numel() == 0:
-                columns.append(scene.means.new_zeros(len(scene), 3))
+                columns.append(scales.new_zeros(len(scales), 3))
                 continue
             unit = self._epsilon(name)
-            size = (self._second[name] / self._weight_sum(1)).flatten(1).mean(1, keepdim=True).sqrt()
-            mean, last = _rms(self._first[name] / self._weight_sum(0)), _rms(self._gradients[name])
+            size = (self._second[name][rows] / self._weight_sum(1)).flatten(1).mean(1, keepdim=True).sqrt()
+            mean, last = _rms(self._first[name][rows] / self._weight_sum(0)), _rms(self._gradients[name][rows])
             columns += [
                 torch.log10(size / unit + 1e-4) / 2,
                 mean / (size + least * unit),
                 torch.log10(last / (size + least * unit) + 1e-2) / 2,
             ]
-        columns += [self._directions[name].clamp(-3, 3) for name in ("scales", "opacities", "features_dc")]
-        scales = _bounded(scene.scales)
+        columns += [self._directions[name][rows].clamp(-3, 3) for name in ("scales", "opacities", "features_dc")]
+        scales = _bounded(scales)
         mean = scales.mean(1, keepdim=True)
         columns += [
-            scene.opacities.clamp(-12, 12) / 4,
+            opacities.clamp(-12, 12) / 4,
             ((mean - self._log_size) / 2).clamp(-4, 4),
             ((scales.amax(1, keepdim=True) - mean) / 2).clamp(0, 4),
             ((mean - scales.amin(1, keepdim=True)) / 2).clamp(0, 4),
             ((scales - mean) / 2).clamp(-4, 4),
-            scene.features_dc.clamp(-4, 4) / 2,
-            self._visibility / self._weight_sum(1),
+            colours.clamp(-4, 4) / 2,
+            self._visibility[rows] / self._weight_sum(1),
         ]
         log_steps = math.log10(min(max(steps, REPAIR.fewest_steps), REPAIR.most_steps))
-        same = scene.means.new_tensor([done, log_steps, self._log_keep]).expand(len(scene), 3)
+        same = scene.means.new_tensor([done, log_steps, self._log_keep]).expand(len(scales), 3)
         return torch.cat([*columns, same], dim=1).float().clamp_(-8, 8).nan_to_num_(0.0)
 
 

@@ -20,7 +20,6 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
-from pointsplat_ns.system.threads import one_thread
 from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import View
 
@@ -79,8 +78,7 @@ def repair(
                 expected = budget.steps
             else:
                 expected = round(run.count / run.done) if run.done else REPAIR.most_steps
-            with torch.no_grad(), one_thread():  # the same rounding for any number of threads
-                factors = network(feedback.features(scene, run.done, expected))
+            factors = feedback.factors(network, scene, run.done, expected)
         return first_factor * rate_factor(run.done), factors
 
     examples = _examples(dense, views, budget.growth)
@@ -132,10 +130,10 @@ class OptimisationRun:
 def _examples(dense: Gaussians, views: ViewSource, growth: float) -> Iterator[Example]:
     """Views, and renders of the dense scene in them, without end; for ``growth`` times the steps, so many times the
     sampled views and pixels: a large scene has more Gaussians between the pixels, and its projection takes most of the
-    time. A view that comes again is not drawn again, as long as it is among the last 256."""
+    time. A view that comes again is not drawn again, as long as it is among the last 256, or fewer of more pixels."""
     count, side = round(growth * VIEW_COUNTS.stepped), round(math.sqrt(growth) * SMALLEST_SIDE)
 
-    @functools.lru_cache(maxsize=256)  # of 0.7 MB each where pictures are 16 to 9, to 2.8 MB in large scenes
+    @functools.lru_cache(maxsize=round(256 / growth))  # 0.2 GB where pictures are 16 to 9
     def drawn(view: View) -> Tensor:
         with torch.no_grad():
             return render(dense, view)

@@ -211,12 +211,19 @@ class Frames(Sequence[Frame]):
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
+        return self.camera(index), self.data(index)
+
+    def camera(self, index: int) -> Cameras:
+        """The camera (1,) of a photo."""
+        index = range(len(self))[index]
+        return copy.deepcopy(self.dataset.cameras[index : index + 1]).to(self.device)
+
+    def data(self, index: int) -> dict[str, Any]:
+        """The data of a photo."""
         index = range(len(self))[index]
         key = "photo", self._owner, index
-        frame = self.cache.get(key)
-        if frame is None:
-            frame = self.dataset.cameras[index : index + 1], self.dataset.get_data(index, image_type=self.image_type)
-            self.cache.put(key, frame)
-        camera, data = frame
-        moved = {name: data[name].to(self.device) for name in ("image", "mask") if name in data}
-        return copy.deepcopy(camera).to(self.device), {**data, **moved}
+        data = self.cache.get(key)
+        if data is None:
+            data = self.dataset.get_data(index, image_type=self.image_type)
+            self.cache.put(key, data)
+        return {**data, **{name: data[name].to(self.device) for name in ("image", "mask") if name in data}}

@@ -27,7 +27,7 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frames, MemoryCache, Undistor
 from pointsplat_ns.nerfstudio_plugin.pointsplat.dense_scenes import DenseScene, Split
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.system.tensors import FLOATS
-from pointsplat_ns.views import Views
+from pointsplat_ns.views import View, Views
 
 if TYPE_CHECKING:
     from pointsplat_ns.nerfstudio_plugin.pointsplat.datamanager import ScenesDataManagerConfig
@@ -199,11 +199,15 @@ class RunPhotos(Sequence[Example]):
 
     def __init__(self, scene: TrainedScene, frames: Frames):
         self._scene, self._frames = scene, frames
+        self._views: dict[int, View] = {}
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: int) -> Example:  # type: ignore[override]
-        camera, data = self._frames[index]
-        view = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
+        view = self._views.get(index)
+        if view is None:
+            camera = self._frames.camera(index)
+            view = self._views[index] = views_of_cameras(camera, self._scene.background, self._scene.rasterize_mode)[0]
+        data = self._frames.data(index)
         return Example(view, data["image"][..., :3], data.get("mask"))
