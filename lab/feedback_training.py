@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, two_sizes
+from pointsplat_ns.comparing.sizes import RESOLUTION, middle_sized, several_sizes
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import gradients_of
 from pointsplat_ns.compression.repair import initial_rate_factor, rate_factor
@@ -73,8 +73,8 @@ class TrainingScene:
     """Pruned scenes by budget."""
     psnr: dict[str, float]
     """PSNR of each pruned scene by budget, over the pixels that the dense scene covers, dB."""
-    views: tuple[Views, Views]
-    """The same views of two sizes: those of even indices of the first, the others of the second."""
+    views: tuple[Views, ...]
+    """The same views of several sizes, which take turns."""
     _renders: dict[int, Tensor] = field(default_factory=dict)
     """Renders of the dense scene, 8 bits per channel, by the index of the view."""
 
@@ -89,11 +89,11 @@ class TrainingScene:
         pruned = {budget: prune(dense, budget, "merge") for budget in keep}
         reference = DenseReference(dense, middle_sized(views).spread(VIEW_COUNTS.compared))
         psnr = {budget: reference.psnr(scene)[0] for budget, scene in pruned.items()}
-        return cls(name, dense, pruned, psnr, two_sizes(views))
+        return cls(name, dense, pruned, psnr, several_sizes(views))
 
     def view(self, index: int) -> View:
         """A view of the size for its index."""
-        return self.views[index % 2][index]
+        return self.views[index % len(self.views)][index]
 
     @torch.no_grad()
     def target(self, index: int) -> Tensor:

@@ -9,7 +9,7 @@ from functools import cached_property
 from itertools import count as counted
 from pathlib import Path
 
-from pointsplat_ns.comparing.sizes import RESOLUTION, SMALLEST_SIDE, middle_sized, two_sizes
+from pointsplat_ns.comparing.sizes import RESOLUTION, SMALLEST_SIDE, middle_sized, several_sizes
 from pointsplat_ns.errors import DataError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io.runs import may_be_run, open_run
@@ -153,8 +153,8 @@ class ViewSource:
         self, seed: int = 0, count: int = VIEW_COUNTS.stepped, drawn_side: int = SMALLEST_SIDE
     ) -> Iterator[View]:
         """Views to optimise on, without end: none of the :meth:`compared` ones, in random order, each once before any
-        is repeated. Half of them are subsampled from pictures of the size of these, half from whole ones
-        (:func:`~pointsplat_ns.comparing.sizes.two_sizes`), the next time the other way around.
+        is repeated. Each is subsampled from a picture of one of
+        :func:`~pointsplat_ns.comparing.sizes.several_sizes`, the next time of another.
 
         They are known views; if these are fewer than the compared ones, known and sampled ones in turn; if all known
         ones are compared, or there are none, sampled ones.
@@ -192,9 +192,9 @@ class ViewSource:
 
 
 def _in_turn(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
-    """Views in random order, each once before any is repeated, then of the other size; without end. A view that comes
+    """Views in random order, each once before any is repeated, then of another size; without end. A view that comes
     again is the same object."""
-    sizes, generator = [[*of_size] for of_size in two_sizes(views, drawn_side)], random.Random(seed)
+    sizes, generator = [[*of_size] for of_size in several_sizes(views, drawn_side)], random.Random(seed)
     for lap in counted():
         for index in generator.sample(range(len(views)), len(views)):
-            yield sizes[(lap + index) % 2][index]
+            yield sizes[(lap + index) % len(sizes)][index]

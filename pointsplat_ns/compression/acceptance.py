@@ -1,7 +1,7 @@
 """Accepts a change to a smaller scene, a refinement or a repair, or leaves it out.
 
 The scene after it is compared with the scene before it. It is kept if it gains in whole pictures of a middle size,
-lowers the error in at least half of the views, and harms no picture of another size.
+lowers the error in at least half of the views, and harms no picture of another size, or by little of what it gains.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pointsplat_ns.comparing.closeness import Closeness, DenseReference
-from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
+from pointsplat_ns.comparing.sizes import NEARER, RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.view_source import ViewSource
@@ -23,6 +23,9 @@ class AcceptanceSettings:
     """Least gain of PSNR, in dB: the sign of a smaller gain depends on the views."""
     most_loss: float = 0.05
     """Largest loss of PSNR, in dB, in pictures of another size."""
+    lost_share: float = 0.25
+    """The same as a share of the gain, if that is more: details smaller than a pixel look larger in small pictures, so
+    that no few Gaussians are right in all sizes."""
 
 
 ACCEPTANCE = AcceptanceSettings()
@@ -48,7 +51,7 @@ class Comparison:
         self.device = dense.device
         whole = views.whole()
         sides = sides_of(whole.width, whole.height)
-        others = (sides[0], sides[-1], 4 * sides[-1])
+        others = (sides[0], sides[-1], NEARER * sides[-1])
         self._others = RendersOfSizes(dense, whole, others) if len(sides) > 1 else None
 
     def judged(
@@ -65,7 +68,8 @@ class Comparison:
         after = self.reference.closeness(end, lambda share: progress("comparing renders", share))
         reason = _why_no_gain(before, after)
         if not reason and self._others is not None:
-            least = (psnr - ACCEPTANCE.most_loss for psnr in self._others.psnrs(old.to(self.device)))
+            lost = max(ACCEPTANCE.most_loss, ACCEPTANCE.lost_share * (after.psnr - before.psnr))
+            least = (psnr - lost for psnr in self._others.psnrs(old.to(self.device)))
             if not all(psnr >= bound for bound, psnr in zip(least, self._others.psnrs(end), strict=True)):  # NaN too
                 reason = "it harms pictures of another size"
         return after, reason

@@ -116,15 +116,15 @@ def test_views_to_optimise_on_are_none_of_those_compared(hollow_ball):
     assert first != second
 
 
-def test_steps_draw_few_pixels_of_each_view_as_of_two_sizes(hollow_ball):
+def test_steps_draw_few_pixels_of_each_view_as_of_several_sizes(hollow_ball):
     source = ViewSource(hollow_ball, given=sample_views(hollow_ball, 40, 640, 480))
-    taken = list(itertools.islice(source.others(), 56))
+    taken = list(itertools.islice(source.others(), 84))
     assert {(view.width, view.height) for view in taken} == {(320, 240)}
     widened: dict[tuple[float, ...], set[float]] = {}
     for view in taken:
         widened.setdefault(place(view.viewmat), set()).add(round(view.eps2d, 4))
-    of_both = {round(0.3 * (320 / side) ** 2, 4) for side in (453, 640)}
-    assert len(widened) == 28 and all(found == of_both for found in widened.values())
+    of_all = {round(0.3 * (320 / side) ** 2, 4) for side in (453, 640, 2560)}
+    assert len(widened) == 28 and all(found == of_all for found in widened.values())
 
 
 def test_few_views_beside_the_compared_ones_take_turns_with_sampled_ones(hollow_ball):
