@@ -133,8 +133,8 @@ class Capture:
         return about | {"cpu_seconds": round(seconds, 1), "needs_dense": with_dense} | means
 
 
-def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row]) -> Iterator[Row]:
-    """The rows that are missing."""
+def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row], long: bool = True) -> Iterator[Row]:
+    """The rows that are missing, of the long training only if it is asked for."""
     there = {(row["keep"], row["method"]): row for row in known}
     if (1.0, DENSE) not in there:
         row = capture.row(1.0, DENSE, *capture.train(), with_dense=False)
@@ -147,7 +147,7 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row]) -> It
             if (keep, method) not in there:
                 there[keep, method] = capture.row(keep, method, *capture.reduced([*_POINTSPLAT, *words], count), True)
                 yield there[keep, method]
-        if (keep, COMPACTED_LONG) not in there:
+        if long and (keep, COMPACTED_LONG) not in there:
             command = [*_POINTSPLAT, *WAYS[COMPACTED], "--seconds", f"{dense['cpu_seconds']:.0f}"]
             yield capture.row(keep, COMPACTED_LONG, *capture.reduced(command, count), True)
         seconds = there[keep, COMPACTED]["cpu_seconds"]
@@ -231,6 +231,7 @@ def main(
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     write_from: Annotated[tuple[Path, ...], tyro.conf.arg(name="write")] = (),
     record: Path = FOLDER,
+    long: bool = True,
 ) -> None:
     """Compare ways to a small scene of one capture, in its held-out photos.
 
@@ -243,6 +244,7 @@ def main(
         json_path: file of rows of this and other captures, taken up and written after each row.
         write_from: only write the record, from these files.
         record: folder of the record.
+        long: whether to measure the long training, too.
     """
     if write_from:
         write(write_from, record)
@@ -256,7 +258,7 @@ def main(
     capture = Capture(name, arguments, steps, folder.resolve(), lpips)
     if results.of(name) and not capture.dense.is_dir():
         raise SystemExit(f"{json_path} has rows of {name}, but {capture.dense} is missing; expected the same --folder")
-    for row in measured(capture, keep, results.of(name)):
+    for row in measured(capture, keep, results.of(name), long):
         results.put(name, [*results.of(name), row])
         print(row, flush=True)
     print(scene_table(results.of(name)))
