@@ -153,9 +153,11 @@ def compact(
     budget, suffix = RepairBudget(effort, seconds), format_to_write(output).suffix
     trained = None if refiner is None else ps.load_refiner(refiner)
     request = CompactRequest.of(trained, keep, by, sh, clean, budget, bool(photos), suffix, target_db)
-    looking = Looking(poses, resolution, up, data, photos)
+    unfinished = output.with_name(f".{output.name}.unfinished")
+    request, looking = replace(request, unfinished=unfinished), Looking(poses, resolution, up, data, photos)
     dense, result, source = compact_source(scene, request, looking, progress=True)
     ps.save(result.scene, output, progress=True, overwrite=True)
+    unfinished.unlink(missing_ok=True)
     quality = quality_of_file(result.judge or judge_of(dense, source), result.scene, output)
     if quality is not None:
         quality = replace(quality, photos=result.photo_gain)

@@ -17,7 +17,7 @@ from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget, RepairBudget
+from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -68,7 +68,7 @@ def compact_scene(
         stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
     error_left = last_kept(stages).after
     if judge is not None and error_left is not None and error_left.psnr < math.inf and not request.repair.empty:
-        stages.append(_repaired(last_kept(stages), at_work, request.repair, judge, views, progress))
+        stages.append(_repaired(last_kept(stages), at_work, request, judge, views, progress))
     interrupted = stages[-1].interrupted
     if photos is not None and request.photos is not None and not request.photos.empty and not interrupted:
         stages.append(_trained(last_kept(stages), at_work, request.photos, photos, reference, views, progress))
@@ -96,13 +96,14 @@ def _refined(
 
 
 def _repaired(
-    last: Stage, dense: Gaussians, budget: RepairBudget, judge: Comparison, views: ViewSource, progress: Progress
+    last: Stage, dense: Gaussians, request: CompactRequest, judge: Comparison, views: ViewSource, progress: Progress
 ) -> Stage:
     """The repair of the last stage that was kept, which was compared; ``dense`` is on the device that renders."""
     assert last.after is not None
     progress("repairing", 0.0)
     report = functools.partial(progress, "repairing")
-    repaired = repair(last.scene.to(dense.device), dense, views, budget, report, psnr=last.after.psnr)
+    scene, psnr = last.scene.to(dense.device), last.after.psnr
+    repaired = repair(scene, dense, views, request.repair, report, psnr=psnr, unfinished=request.unfinished)
     after, reason = judge.judged(last.after, last.scene, repaired.scene)
     scene, figures = repaired.scene.to(last.scene.device), (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, after, last.after, reason, *figures)

@@ -63,6 +63,10 @@ class Feedback(Adam):
         visible = (gradients["features_dc"] != 0).any(1, keepdim=True)
         self._visibility.lerp_(visible.to(self._visibility), 1 - self._settings.betas[1])
 
+    def state(self) -> dict[str, Tensor]:
+        """As :meth:`Adam.state`."""
+        return {**super().state(), "visibility": self._visibility}
+
     @torch.no_grad()
     def factors(self, network: Callable[[Tensor], Tensor], scene: Gaussians, done: float, steps: int) -> Tensor:
         """Factors (K, 6) of the steps that a network makes of :meth:`features`, which has the other arguments. It gets

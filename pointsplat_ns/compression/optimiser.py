@@ -20,6 +20,7 @@ from pointsplat_ns.metrics import PIXEL_LOSSES, SSIM_WINDOW, PixelLoss
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View
 
@@ -100,6 +101,18 @@ class Adam:
         """A scene after a step; arguments as for :meth:`moves`."""
         moves = self.moves(share, factors)
         return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next steps depend on, by name: the averages themselves, and the damping."""
+        averages = {"first": self._first, "second": self._second}
+        state = {f"{which}.{name}": value for which, kind in averages.items() for name, value in kind.items()}
+        return {**state, "damping": torch.tensor([*self._damping.values()], **DOUBLES)}
+
+    def restore(self, state: Mapping[str, Tensor], steps: int) -> None:
+        """Take over the state after some steps, from tensors of the shapes of :meth:`state`."""
+        self._steps, self._damping = steps, dict(zip(RATES, state["damping"].tolist(), strict=True))
+        for name, value in self.state().items():
+            value.copy_(state[name])
 
     def root_mean_square(self, name: str) -> Tensor:
         """Root of the mean square of the gradients by a parameter so far, (K,): over steps, summed over components."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -16,6 +18,7 @@ from pointsplat_ns.comparing.sizes import SMALLEST_SIDE
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import optimised
 from pointsplat_ns.compression.requests import STEPS, Effort, RepairBudget
+from pointsplat_ns.compression.unfinished import Unfinished
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
@@ -45,6 +48,7 @@ def repair(
     progress: Callable[[float], None] | None = None,
     network: FeedbackRefiner | Literal["shipped"] | None = "shipped",
     psnr: float = 0.0,
+    unfinished: Path | None = None,
 ) -> Repaired:
     """Optimise a smaller scene against renders of the dense one; its number of Gaussians does not change.
 
@@ -61,6 +65,8 @@ def repair(
         network: on the scene's device; by default the shipped one, None for plain Adam.
         psnr: PSNR of ``scene`` over the pixels that the dense scene covers, dB. Above
             ``REPAIR.nearly_right`` the steps are smaller.
+        unfinished: a file for the state of a repair of a number of steps, each minute. If it is there, and of the same
+            repair, the steps continue from it, to the same bits. The caller removes it.
 
     Raises:
         DataError: if nothing of the scene is visible.
@@ -70,6 +76,14 @@ def repair(
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
     feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
+    work = len(dense), budget, psnr, views.compared().viewmats.tolist()
+    file = Unfinished(None if budget.seconds is not None else unfinished, scene, work)
+    found = file.state({**feedback.state(), **dict(scene.items())})
+    if found is not None:
+        run.count, state = found
+        run.done = budget.share_done(run.count, 0.0)
+        feedback.restore(state, run.count)
+        scene = scene.replace(**{name: state[name] for name, _ in scene.items()})
 
     def choose(scene: Gaussians) -> tuple[float, Tensor | None]:
         factors = None
@@ -81,8 +95,13 @@ def repair(
             factors = feedback.factors(network, scene, run.done, expected)
         return first_factor * rate_factor(run.done), factors
 
-    examples = _examples(dense, views, budget.growth)
-    last = run.take(scene, optimised(scene, feedback, examples, choose), progress)
+    def kept(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
+        for count, scene in enumerate(scenes, first + 1):
+            file.save(count, lambda scene=scene: {**feedback.state(), **dict(scene.items())})  # type: ignore[misc]
+            yield scene
+
+    examples = _examples(dense, views, budget.growth, run.count)
+    last = run.take(scene, kept(optimised(scene, feedback, examples, choose), run.count), progress)
     return Repaired(last, run.count, run.seconds, run.interrupted)
 
 
@@ -127,10 +146,13 @@ class OptimisationRun:
         return scene
 
 
-def _examples(dense: Gaussians, views: ViewSource, growth: float) -> Iterator[Example]:
-    """Views, and renders of the dense scene in them, without end; for ``growth`` times the steps, so many times the
-    sampled views and pixels: a large scene has more Gaussians between the pixels, and its projection takes most of the
-    time. A view that comes again is not drawn again, as long as it is among the last 256, or fewer of more pixels."""
+def _examples(dense: Gaussians, views: ViewSource, growth: float, taken: int = 0) -> Iterator[Example]:
+    """Views after those ``taken``, and renders of the dense scene in them, without end.
+
+    For ``growth`` times the steps, there are so many times the sampled views and pixels: a large scene has more
+    Gaussians between the pixels, and its projection takes most of the time. A view that comes again is not drawn again,
+    as long as it is among the last 256, or fewer of more pixels.
+    """
     count, side = round(growth * VIEW_COUNTS.stepped), round(math.sqrt(growth) * SMALLEST_SIDE)
 
     @functools.lru_cache(maxsize=round(256 / growth))  # 0.2 GB where pictures are 16 to 9
@@ -138,7 +160,8 @@ def _examples(dense: Gaussians, views: ViewSource, growth: float) -> Iterator[Ex
         with torch.no_grad():
             return render(dense, view)
 
-    return (Example(view, drawn(view)) for view in views.others(count=count, drawn_side=side))
+    others = itertools.islice(views.others(count=count, drawn_side=side), taken, None)
+    return (Example(view, drawn(view)) for view in others)
 
 
 def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:

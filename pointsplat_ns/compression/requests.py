@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -156,6 +157,8 @@ class CompactRequest:
     """Least PSNR of the file against the dense scene's renders, dB, in place of the budget; None for none."""
     most_lost: float | None = None
     """Largest loss of PSNR of the file in held-out photos, dB, in place of the budget; None for none."""
+    unfinished: Path | None = None
+    """The file of :func:`~pointsplat_ns.compression.repair.repair`'s state; None for none."""
 
     @classmethod
     def of(

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import sys
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from pointsplat_ns.api import example_room
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, gradients_of, nonzero_rms, optimised
 from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
+from pointsplat_ns.compression.unfinished import Unfinished
 from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import changed
@@ -98,6 +100,29 @@ def test_an_interruption_loses_nothing(hollow_ball, pruned):
     repaired = repair(pruned, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), stop)
     assert repaired.interrupted and repaired.steps == 7  # 7/32 is the first share above 0.2
     assert bool(repaired.scene.usable().all()) and not same(repaired.scene, pruned)
+
+
+def test_a_killed_repair_continues_to_the_same_bits(hollow_ball, pruned, tmp_path, monkeypatch):
+    monkeypatch.setattr(Unfinished, "SECONDS", 0.0)
+    file = tmp_path / "unfinished"
+
+    def repaired(killed_at=99.0, start=pruned):
+        done = []
+        try:
+            report = lambda share: done.append(share) or (share > killed_at and sys.exit())  # noqa: E731
+            last = repair(start, hollow_ball, FewViews(hollow_ball), RepairBudget("quick"), report, unfinished=file)
+        except SystemExit:
+            return None, done
+        return last.scene, done
+
+    whole, _ = repaired()
+    file.unlink()
+    assert repaired(0.3)[0] is None and repaired(0.6)[1][0] == 11 / 32
+    rest, done = repaired()
+    assert same(rest, whole) and done[0] == 21 / 32
+    assert len(repaired(start=pruned.replace(means=pruned.means + 0.1))[1]) == 32, "another scene starts anew"
+    file.write_bytes(file.read_bytes()[:-9])
+    assert len(repaired()[1]) == 32, "so does a damaged file"
 
 
 @pytest.mark.parametrize("budget", [("slow",), ("quick", -1.0), ("quick", math.nan), ("quick", math.inf)])
