@@ -108,11 +108,12 @@ class Capture:
         words += ["--steps-per-eval-image", "0", "--steps-per-save", str(self.steps)]
         return self.dense, _cpu_seconds([*words, *self.arguments[1:]])
 
-    def reduced(self, words: list[str], count: int) -> tuple[Path, float]:
-        """What a program makes of the dense run, and its CPU seconds."""
+    def reduced(self, program: list[str], count: int, options: list[str]) -> tuple[Path, float]:
+        """What a program makes of the dense run, with options, and its CPU seconds."""
         target = self.folder / f"{self.name}-small.ply"
         target.unlink(missing_ok=True)
-        return target, _cpu_seconds([*words, str(self.dense), "--keep", str(count), "-o", str(target)])
+        words = [*program, str(self.dense), "--keep", str(count), "-o", str(target), *options]
+        return target, _cpu_seconds(words)
 
     @torch.no_grad()
     def row(self, keep: float, method: str, scene: Path, seconds: float, with_dense: bool) -> Row:
@@ -143,18 +144,19 @@ def measured(capture: Capture, keeps: tuple[float, ...], known: list[Row], long:
     dense = there[1.0, DENSE]
     for keep in keeps:
         count = count_of(keep, dense["count"])
-        for method, words in WAYS.items():
+        for method, (command, *options) in WAYS.items():
             if (keep, method) not in there:
-                there[keep, method] = capture.row(keep, method, *capture.reduced([*_POINTSPLAT, *words], count), True)
+                found = capture.reduced([*_POINTSPLAT, command], count, options)
+                there[keep, method] = capture.row(keep, method, *found, True)
                 yield there[keep, method]
         if long and (keep, COMPACTED_LONG) not in there:
-            command = [*_POINTSPLAT, *WAYS[COMPACTED], "--seconds", f"{dense['cpu_seconds']:.0f}"]
-            yield capture.row(keep, COMPACTED_LONG, *capture.reduced(command, count), True)
+            command, *options = *WAYS[COMPACTED], "--seconds", f"{dense['cpu_seconds']:.0f}"
+            yield capture.row(keep, COMPACTED_LONG, *capture.reduced([*_POINTSPLAT, command], count, options), True)
         seconds = there[keep, COMPACTED]["cpu_seconds"]
         for by, method in SCORES.items():
             if (keep, method) not in there:
-                command = [sys.executable, "-m", "lab.training.score_and_train", by, str(seconds)]
-                yield capture.row(keep, method, *capture.reduced(command, count), True)
+                program = [sys.executable, "-m", "lab.training.score_and_train", by, str(seconds)]
+                yield capture.row(keep, method, *capture.reduced(program, count, []), True)
 
 
 def _cpu_seconds(words: list[str]) -> float:

@@ -20,8 +20,8 @@ class Tried(program.Capture):
     def train(self):
         return self.folder, 1010.0
 
-    def reduced(self, words, count):
-        self.asked.append((*words[3:], count))
+    def reduced(self, program, count, options):
+        self.asked.append((*program[3:], count, *options))
         return self.folder, 60.0
 
     def row(self, keep, method, scene, seconds, with_dense):
@@ -34,8 +34,8 @@ def test_all_ways_are_measured_and_scores_train_as_long_as_compact(tmp_path):
     capture = Tried(tmp_path)
     rows = list(program.measured(capture, (0.1,), []))
     assert [found["method"] for found in rows] == list(METHODS) and rows[0]["cpu_seconds"] == 1010
-    assert ("compact", "--photos", 100) in capture.asked
-    assert ("compact", "--photos", "--seconds", "1010", 100) in capture.asked
+    assert ("compact", 100, "--photos") in capture.asked
+    assert ("compact", 100, "--photos", "--seconds", "1010") in capture.asked
     assert ("lightgaussian", "60.0", 100) in capture.asked and ("pup", "60.0", 100) in capture.asked
     assert [found["needs_dense"] for found in rows] == [False] + [True] * 6
 
