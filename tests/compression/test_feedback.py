@@ -9,7 +9,7 @@ from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.refiner.feedback import FeedbackRefiner
+from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +71,14 @@ def test_factors_reach_their_parameters_and_what_no_view_shows_stays(scene):
     for kind, name in enumerate(PARAMETERS):
         torch.testing.assert_close(learned[name], (kind + 1) * plain[name])
         assert not learned[name][3].any()
+
+
+def test_factors_in_pieces_are_those_of_the_whole(scene):
+    many = scene[torch.arange(5000) % len(scene)]
+    feedback, network = Feedback(many, 9000), shipped_feedback_refiner(torch.device("cpu"))
+    feedback.observe(gradients(many, 0))
+    expected = network(feedback.features(many, 0.5, 8))
+    torch.testing.assert_close(feedback.factors(network, many, 0.5, 8), expected, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e18])

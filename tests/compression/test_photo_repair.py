@@ -152,13 +152,6 @@ def test_every_kth_pixel_of_a_photo_is_what_its_view_draws(hollow_ball, generato
     assert every_kth_pixel(whole, 100, CPU).target.shape == (120, 159, 3)
 
 
-def test_photos_of_bytes_count_in_255ths(photos):
-    as_bytes = photos[0]._replace(target=(255 * photos[0].target).round().to(torch.uint8))
-    target = every_kth_pixel(as_bytes, 20, CPU).target
-    assert target.dtype == torch.float32 and target.shape == (18, 24, 3)
-    assert torch.allclose(target, every_kth_pixel(photos[0], 20, CPU).target, atol=0.6 / 255)
-
-
 def test_masked_pixels_neither_pull_nor_count(hollow_ball, pruned, photos):
     mask = torch.zeros(36, 48, 1, dtype=torch.bool)
     mask[:, :24] = True
