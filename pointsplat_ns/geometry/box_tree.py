@@ -72,18 +72,19 @@ class BoxTree:
         query, box = numbers(m, queries.device), torch.zeros_like(first)
         for level in range(1, len(self._boxes)):
             query, box = query.repeat_interleave(2), torch.stack([2 * box, 2 * box + 1], dim=1).flatten()
-            nearer = self._to_boxes(level, queries[query], box) < most[query]
+            nearer = (self._to_boxes(level, queries[query], box) < most[query]).nonzero()[:, 0]
             query, box = query[nearer], box[nearer]
             if m > 1 and len(query) > PAIRS_AT_ONCE:
                 halves = [self._nearest(half, k) for half in queries.split(-(-m // 2))]
                 return torch.cat([half[0] for half in halves]), torch.cat([half[1] for half in halves])
-        others = box != first[query]
+        others = (box != first[query]).nonzero()[:, 0]
         query, box = query[others], box[others]
         more, where = self._in_leaves(queries[query], box)
-        nearer = more < most[query, None]
+        row, slot = (more < most[query, None]).nonzero(as_tuple=True)
 
-        owners = torch.cat([numbers(m, queries.device).repeat_interleave(k), query[:, None].expand_as(more)[nearer]])
-        squares, spots = torch.cat([squares.flatten(), more[nearer]]), torch.cat([spots.flatten(), where[nearer]])
+        owners = torch.cat([numbers(m, queries.device).repeat_interleave(k), query[row]])
+        squares = torch.cat([squares.flatten(), more[row, slot]])
+        spots = torch.cat([spots.flatten(), where[row, slot]])
         order = squares.sort(stable=True).indices
         order = order[owners[order].sort(stable=True).indices]  # by query, then by distance
         counts = torch.zeros_like(first).scatter_add_(0, owners, torch.ones_like(owners))
