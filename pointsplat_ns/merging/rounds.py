@@ -119,7 +119,10 @@ def merge_levels(
 
 
 def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Result]) -> Result:
-    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory for it."""
+    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory for it, or lacks
+    float64."""
+    if scene.device.type == "mps":
+        scene = scene.to("cpu")
     try:
         return function(scene)
     except torch.OutOfMemoryError:
