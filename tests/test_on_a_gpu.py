@@ -2,17 +2,21 @@
 numbers, and the same results as on the CPU."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 import torch
 
 import pointsplat_ns as ps
 from making import box_room, dense_config, same, small_refiner
+from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.compression import trained_refiner
 from pointsplat_ns.compression.repair import STEPS
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
+from pointsplat_ns.merging import MERGING, Merger, merge, merge_levels, rounds
+from pointsplat_ns.merging.rounds import one_round
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.refiner import save_refiner
 from pointsplat_ns.system.threads import fixed_threads
@@ -89,7 +93,7 @@ def test_gradients_reach_a_viewmat_on_any_device(room, views, cameras_on, dtype)
         torch.testing.assert_close(ours, right, atol=1e-6 * float(right.abs().max()), rtol=1e-4)
 
 
-@pytest.mark.parametrize("by", METHODS)
+@pytest.mark.parametrize("by", [by for by in METHODS if by != "merge"])
 def test_every_method_keeps_the_same_gaussians_on_a_gpu(by, room, views):
     given = views if METHODS[by].needs_views else None
     wanted = ps.prune(room, 0.3, by=by, views=given)
@@ -101,11 +105,34 @@ def test_every_method_keeps_the_same_gaussians_on_a_gpu(by, room, views):
     assert same(kept, wanted)
 
 
-def test_views_are_sampled_of_a_scene_on_a_gpu_as_on_the_cpu(room, views):
+def test_merging_on_a_gpu_loses_as_much_as_on_the_cpu_in_the_views_that_are_sampled(views):
+    dense, counts = box_room(1, count=2500, size=0.05), (900, 250)
+    settings = replace(MERGING, sampled_views=3, finish_views=1)
+    wanted = [merge(dense, k, settings=settings).scene for k in counts]
     with pretend_gpu() as gpu:
-        found = ps.sample_views(room.to(GPU), 3, width=32, height=24)
+        merger = Merger(dense.to(GPU), settings=settings)
+        found = [merger.merged(k).scene.to("cpu") for k in counts]
     check(gpu)
-    assert torch.equal(found.viewmats, views.viewmats) and torch.equal(found.Ks, views.Ks)
+    assert [len(scene) for scene in found] == [*counts]
+    reference = DenseReference(dense, views)
+    for ours, right in zip(found, wanted, strict=True):
+        assert abs(reference.psnr(ours)[0] - reference.psnr(right)[0]) < 0.05  # dB, by rounding of costs
+
+
+def test_the_cpu_merges_what_is_too_large_for_a_gpu(room, views, monkeypatch, caplog):
+    def full(step, *rest):
+        if step.participants.scene.device == GPU:
+            raise torch.OutOfMemoryError
+        return one_round(step, *rest)
+
+    monkeypatch.setattr(rounds, "one_round", full)
+    with pretend_gpu():
+        merger = Merger(room.to(GPU), views)
+        found = [*merge_levels(room.to(GPU), [60, 50], views=views), merger.merged(60), merger.merged(50)]
+        assert {merged.scene.device for merged in found} == {GPU} and "too little memory" in caplog.text
+        found = [merged.to("cpu").scene for merged in found]
+    wanted = [*merge_levels(room, [60, 50], views=views), *(merge(room, k, views=views) for k in (60, 50))]
+    assert all(same(ours, right.scene) for ours, right in zip(found, wanted, strict=True))
 
 
 def test_compact_on_a_gpu_draws_from_one_thread_and_loses_as_much(room, views, tmp_path, monkeypatch):

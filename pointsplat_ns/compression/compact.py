@@ -53,8 +53,9 @@ def compact_scene(
     start = time.perf_counter()
     request.check_sh_degree(dense)
     views = views or ViewSource(dense)
-    pruned = prune_scene(dense, request.prune, views, progress, rounding=False)
     at_work = dense.to(request.device)
+    pruned = prune_scene(at_work, request.prune, views, progress, rounding=False)
+    pruned = replace(pruned, scene=pruned.scene.to(dense.device))
     judge, reference, uncompared = None, None, ""
     try:
         progress("comparing renders", 0.0)

@@ -1,18 +1,14 @@
-"""Nearest neighbours among points in space, by scipy's k-d tree: exact, in float64."""
+"""Nearest neighbours among points in space: exact, in float64. On a CPU, scipy's k-d tree finds them."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from pointsplat_ns.geometry.box_tree import BoxTree
 from pointsplat_ns.system.pieces import CHUNK
-from pointsplat_ns.system.tensors import FLOATS, INDICES
+from pointsplat_ns.system.tensors import FLOATS, numbers
 from pointsplat_ns.system.threads import most_threads
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 QUERIES_AT_ONCE = 1 << 17
 """Number of points whose neighbours are searched at once, to save memory."""
@@ -40,20 +36,30 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         nothing = torch.empty(0, 0, **FLOATS)
         return nothing.double(), nothing.long()
     places = points.detach().double().cpu()
-    return _nearest_of(_tree_of(places), places, min(k, n))
+    return _CpuTree(places).nearest(places, min(k, n))
 
 
-def _tree_of(points: Tensor) -> cKDTree:
-    from scipy.spatial import cKDTree
+class _CpuTree:
+    """What :class:`~pointsplat_ns.geometry.box_tree.BoxTree` is elsewhere, of points (N, D) float64, by scipy."""
 
-    return cKDTree(points.numpy(), balanced_tree=False)
+    def __init__(self, points: Tensor):
+        from scipy.spatial import cKDTree
+
+        self._tree = cKDTree(points.numpy(), balanced_tree=False)
+
+    @property
+    def order(self) -> Tensor:
+        return torch.from_numpy(self._tree.indices.copy())  # newer releases give what must not be written to
+
+    def nearest(self, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        # The ranks are listed, because k = 1 would drop their axis.
+        distances, indices = self._tree.query(queries.numpy(), k=list(range(1, k + 1)), workers=most_threads())
+        return torch.from_numpy(distances), torch.from_numpy(indices).long()
 
 
-def _nearest_of(tree: cKDTree, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Distances (m, k) float64 and indices (m, k) int64 of the points of a tree that are nearest to queries (m, D)."""
-    # The ranks are listed, because k = 1 would drop their axis.
-    distances, indices = tree.query(queries.numpy(), k=list(range(1, k + 1)), workers=most_threads())
-    return torch.from_numpy(distances), torch.from_numpy(indices).long()
+def _tree_of(points: Tensor, k: int) -> _CpuTree | BoxTree:
+    """A tree of points (N, 3) that finds at most ``k`` neighbours."""
+    return _CpuTree(points) if points.device.type == "cpu" else BoxTree(points, k)
 
 
 def other_neighbours(points: Tensor, k: int) -> Tensor:
@@ -63,19 +69,20 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
     two, those before and after it in the order of the search tree, where no two coincident points are far apart.
 
     Args:
-        points: (N, 3) float64, finite, on the CPU.
+        points: (N, 3) float64, finite, on any device.
         k: number of neighbours, at least 2.
 
     Returns:
-        Indices (N, k) int32, the nearest first; a point's own index stands for none.
+        Indices (N, k) int32 on that device, the nearest first; a point's own index stands for none.
     """
-    own = torch.arange(len(points), **INDICES)
+    own = numbers(len(points), points.device)
     near = own.to(torch.int32)[:, None].repeat(1, k)
     if not len(points):
         return near
-    tree, found = _tree_of(points), min(k + 1, len(points))
+    found = min(k + 1, len(points))
+    tree = _tree_of(points, found)
     for these in own.split(QUERIES_AT_ONCE):
-        _, indices = _nearest_of(tree, points[these], found)
+        _, indices = tree.nearest(points[these], found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
         indices = indices.where(indices != these[:, None], indices[:, :1])
         near[these, : found - 1] = indices[:, 1:].to(torch.int32)
@@ -87,7 +94,7 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
     ]
     crowd = torch.cat(same).nonzero()[:, 0]
     if len(crowd):
-        walk = torch.from_numpy(tree.indices.copy())  # newer releases of scipy give what must not be written to
+        walk = tree.order
         before, after = torch.empty_like(walk), torch.empty_like(walk)
         before[walk], after[walk] = walk.roll(1), walk.roll(-1)
         near[crowd, k - 2], near[crowd, k - 1] = before[crowd].to(torch.int32), after[crowd].to(torch.int32)
@@ -98,14 +105,15 @@ class NearestOf:
     """The nearest points of other places.
 
     Args:
-        points: (N, 3) float64, finite, on the CPU; N is at least 1.
+        points: (N, 3) float64, finite, on any device; N is at least 1.
         k: number of neighbours.
     """
 
     def __init__(self, points: Tensor, k: int):
-        self._tree, self._k = _tree_of(points), min(k, len(points))
+        self._k = min(k, len(points))
+        self._tree = _tree_of(points, self._k)
 
     def __call__(self, queries: Tensor) -> Tensor:
-        """Indices (m, min(k, N)) int64 of the points nearest to queries (m, 3) float64, finite, on the CPU; the nearest
-        first."""
-        return _nearest_of(self._tree, queries, self._k)[1]
+        """Indices (m, min(k, N)) int64 of the points nearest to queries (m, 3) float64, finite, on their device; the
+        nearest first."""
+        return self._tree.nearest(queries, self._k)[1]

@@ -42,18 +42,52 @@ def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None)
 
 def pack(matrix: Tensor) -> Tensor:
     """(N, 6) of symmetric (N, 3, 3)."""
-    return matrix.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    a, b, c, _, d, e, _, _, f = matrix.reshape(-1, 9).unbind(1)
+    return torch.stack([a, b, c, d, e, f], dim=1)
 
 
 def unpack(six: Tensor) -> Tensor:
     """(N, 3, 3) of (N, 6)."""
-    return six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+    a, b, c, d, e, f = six.unbind(1)
+    return torch.stack([a, b, c, b, d, e, c, e, f], dim=1).view(-1, 3, 3)
+
+
+def diagonals(six: Tensor) -> Tensor:
+    """Diagonals (N, 3) of (N, 6)."""
+    return torch.stack([six[:, 0], six[:, 3], six[:, 5]], dim=1)
 
 
 def outer(vector: Tensor) -> Tensor:
     """(N, 6): vector times its transpose, of (N, 3)."""
     x, y, z = vector.unbind(1)
     return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=1)
+
+
+def eigen(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3) in columns of symmetric matrices (N, 3, 3) float64, on
+    a CPU by LAPACK. A GPU has no library that is made for so many small ones, and takes Jacobi rotations, in 6 sweeps:
+    each squares the error."""
+    if matrices.device.type == "cpu":
+        values, vectors = torch.linalg.eigh(matrices)
+        return values, vectors
+    unit = torch.eye(3, **DOUBLES).to(matrices.device)
+    vectors = unit.expand_as(matrices)
+    for p, q in 6 * ((0, 1), (0, 2), (1, 2)):
+        angle = 0.5 * (2 * matrices[:, p, q] / (matrices[:, q, q] - matrices[:, p, p])).atan().nan_to_num_(0.0)
+        rotation = unit.repeat(len(matrices), 1, 1)
+        rotation[:, p, p] = rotation[:, q, q] = angle.cos()
+        rotation[:, p, q], rotation[:, q, p] = angle.sin(), -angle.sin()
+        matrices, vectors = rotation.transpose(1, 2) @ matrices @ rotation, vectors @ rotation
+    values, order = matrices.diagonal(dim1=1, dim2=2).sort(dim=1)
+    return values, vectors.gather(2, order[:, None].expand_as(vectors))
+
+
+def inverses_and_log_determinants(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses (N, 3, 3) and logarithms of determinants (N,) of positive definite matrices (N, 3, 3) float64."""
+    if matrices.device.type == "cpu":
+        return torch.linalg.inv(matrices), torch.logdet(matrices)
+    values, vectors = eigen(matrices)
+    return vectors / values[:, None] @ vectors.transpose(1, 2), values.log().sum(1)
 
 
 def adjugate(six: Tensor) -> Tensor:
@@ -92,7 +126,7 @@ def thinnest_axes(six: Tensor) -> Tensor:
         squared = [a * a + b * b + c * c, a * b + b * d + c * e, a * c + b * e + c * f]
         squared += [b * b + d * d + e * e, b * c + d * e + e * f, c * c + e * e + f * f]
         matrix = torch.stack(squared, dim=1)
-    column = matrix[:, [0, 3, 5]].argmax(1)
+    column = diagonals(matrix).argmax(1)
     vector = unpack(matrix)[torch.arange(len(matrix), device=six.device, dtype=torch.int64), column]
     length = vector.norm(dim=1, keepdim=True)
     return torch.where(length > MIN_DIVISOR, vector / length.clamp_min(MIN_DIVISOR), vector.new_tensor([0.0, 0.0, 1.0]))

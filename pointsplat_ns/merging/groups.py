@@ -14,13 +14,13 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import quaternions_of
-from pointsplat_ns.merging.covariance import MIN_DIVISOR, unpack
+from pointsplat_ns.merging.covariance import MIN_DIVISOR, eigen, unpack
 from pointsplat_ns.merging.pairs import Round
 from pointsplat_ns.merging.settings import MergeSettings
 from pointsplat_ns.merging.state import Participants, State
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
-from pointsplat_ns.system.pieces import CHUNK
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.system.pieces import pieces
+from pointsplat_ns.system.tensors import add_rows, numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class Groups:
     @classmethod
     def of(cls, participants: Participants, state: State, rounds: Sequence[Round]) -> Groups:
         """The groups that became the Gaussians of a state after some rounds."""
-        group, shares = torch.arange(len(state), **INDICES), torch.ones(len(state), **FLOATS)
+        group, shares = numbers(len(state), state.means.device), torch.ones_like(state.weights)
         for place, share in reversed(rounds):
             group, shares = group[place], shares[place] * share
-        means = state.means.double() * participants.size + participants.centre
+        means = state.means.double() * participants.size + participants.centre.to(group.device)
         cov = state.cov.double() * participants.size**2
         return cls(group, shares, means, cov, state.alphas.double(), state.counts)
 
@@ -59,10 +59,10 @@ def scene_maker(
         The group (n,) of each participant, and a function from a size change, which is added to the log-scales of
         merged Gaussians, to the scene.
     """
-    first = torch.full((len(groups.counts),), len(participants.scene), **INDICES)  # index in the scene of each
+    first = groups.group.new_full((len(groups.counts),), len(participants.scene))  # index in the scene of each
     first, order = first.scatter_reduce_(0, groups.group, participants.members, "amin").sort()
     rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order), **INDICES)
+    rank[order] = numbers(len(order), order.device)
     group, shares = rank[groups.group], groups.shares
     means, cov, alphas, members = (values[order] for values in (groups.means, groups.cov, groups.alphas, groups.counts))
     del groups
@@ -101,10 +101,10 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
     wide = torch.promote_types(scene.dtype, torch.float32)
     means = []
     for values in (scene.features_dc, scene.features_rest):
-        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device="cpu")
-        for rows in torch.arange(len(group), **INDICES).split(CHUNK):
+        mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device=values.device)
+        for rows in pieces(len(group), group.device):
             own = values[participants.members[rows]].to(wide)
-            mean.index_add_(0, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
+            add_rows(mean, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
             of_single = single[group[rows]]
             mean[group[rows][of_single]] = own[of_single]
         means.append(mean.to(scene.dtype))
@@ -113,10 +113,10 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
 
 def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
-    scales, quats = torch.empty(len(cov), 3, **DOUBLES), torch.empty(len(cov), 4, dtype=dtype, device="cpu")
-    for rows in torch.arange(len(cov), **INDICES).split(CHUNK):
-        variances, axes = torch.linalg.eigh(unpack(cov[rows]))
-        axes[:, :, 0] *= torch.linalg.det(axes).sign()[:, None]
+    scales, quats = cov.new_empty(len(cov), 3), cov.new_empty(len(cov), 4, dtype=dtype)
+    for rows in pieces(len(cov), cov.device):
+        variances, axes = eigen(unpack(cov[rows]))
+        axes[:, :, 0] *= torch.linalg.cross(axes[:, :, 1], axes[:, :, 2]).mul_(axes[:, :, 0]).sum(1).sign()[:, None]
         # as covariances(): rounding leaves nothing of what is thinner
         variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
         scales[rows] = 0.5 * variances.log()

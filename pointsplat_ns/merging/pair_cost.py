@@ -45,7 +45,8 @@ from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.system.pieces import pieces
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
 from pointsplat_ns.system.threads import in_threads, most_threads
 
 TINY = 1e-30
@@ -97,17 +98,19 @@ def pair_costs(
     fits = near.shape[1] <= 8 and state.colours.shape[1] <= 8 and near.dtype == torch.int32
     if fits and dtype == torch.float32 and KERNELS.usable_for(compiled, state.means):
         return _by_kernels(state, near, settings)
-    costs = torch.empty(near.shape, dtype=dtype, device="cpu")
+    device = near.device
+    costs, own = torch.empty(near.shape, dtype=dtype, device=device), numbers(len(state), device)
+    to_planes, triples = TO_PLANE.permute(1, 0, 2).reshape(6, -1).to(device), TRIPLES.to(device)
 
-    def fill(rows: Tensor) -> None:
-        _, cov = _within_bounds(state, rows)
-        flat = (cov @ TO_PLANE.permute(1, 0, 2).reshape(6, -1)).view(-1, len(DIRECTIONS), 3)
+    def fill(rows: slice) -> None:
+        _, cov = _within_bounds(state, own[rows])
+        flat = (cov @ to_planes).view(-1, len(DIRECTIONS), 3)
         largest = (flat[..., 0] * flat[..., 2] - flat[..., 1] ** 2).argmax(1)
-        planes = TRIPLES[largest].unbind(1)
-        total = sum(costs_in_plane(state, rows, near[rows].long(), plane, settings, dtype) for plane in planes)
+        planes = triples[largest].unbind(1)
+        total = sum(costs_in_plane(state, own[rows], near[rows].long(), plane, settings, dtype) for plane in planes)
         costs[rows] = total * state.weights[rows, None]
 
-    in_threads(fill, torch.arange(len(state), **INDICES).split(1 << 14), near.device)  # 50 MB at once
+    in_threads(fill, list(pieces(len(state), device, 1 << 14)), device)  # 50 MB at once
     return costs
 
 
@@ -137,8 +140,8 @@ def costs_in_plane(
     :data:`DIRECTIONS`, without visibility weights, (m, k)."""
     everyone = torch.cat([i[:, None], j], dim=1)
     means, cov = (values.view(*everyone.shape, -1) for values in _within_bounds(state, everyone.flatten()))
-    u, v = ((means[:, :1] - means[:, 1:]) @ PLANE_AXES[plane]).to(dtype).unbind(2)
-    uu, uv, vv = (cov @ TO_PLANE[plane]).to(dtype).unbind(2)
+    u, v = ((means[:, :1] - means[:, 1:]) @ PLANE_AXES.to(plane.device)[plane]).to(dtype).unbind(2)
+    uu, uv, vv = (cov @ TO_PLANE.to(plane.device)[plane]).to(dtype).unbind(2)
     # float32 must tell thin projections from lines: widths are at least 0.3 % of lengths
     added = 1e-5 * (uu + vv) + 1e-6**2
     both = Flat(uu + added, uv, vv + added)

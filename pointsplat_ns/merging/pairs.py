@@ -34,7 +34,8 @@ from pointsplat_ns.merging.covariance import (
 )
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
-from pointsplat_ns.system.tensors import FLAGS, FLOATS, INDICES
+from pointsplat_ns.system.pieces import pieces
+from pointsplat_ns.system.tensors import numbers
 
 NEVER = torch.iinfo(torch.int64).max
 """Key of a pair that cannot be."""
@@ -56,17 +57,17 @@ def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_p
         First and second members, (E,) int64 each, and costs, (E,) float32; at least one pair if there is any neighbour.
     """
     n, keys = len(near), _keys(near, costs)
-    rows, others, found = torch.arange(n, **INDICES), near.T.long().contiguous(), []
+    rows, others, found = numbers(n, near.device), near.T.long().contiguous(), []
     for _ in range(passes):
         least, slot = keys.min(0)
-        best = torch.full((n,), NEVER, **INDICES)
+        best = rows.new_full((n,), NEVER)
         best[rows] = least
         best.scatter_reduce_(0, others.flatten(), keys.flatten(), "amin")
         partner = others.gather(0, slot[None])[0]
         mutual = (least == best[rows]) & (least == best[partner]) & (least < NEVER)
         i, j = rows[mutual], partner[mutual]
         found.append((i, j, least[mutual]))
-        taken = torch.zeros(n, **FLAGS)
+        taken = torch.zeros_like(best, dtype=torch.bool)
         taken[i] = taken[j] = True
         keys.masked_fill_(taken[rows] | taken.index_select(0, others.flatten()).view(others.shape), NEVER)
         left = (keys.amin(0) < NEVER).nonzero()[:, 0]
@@ -83,17 +84,17 @@ def _keys(near: Tensor, costs: Tensor) -> Tensor:
     They are ordered as the costs, whose bits are the upper half: the bits of a float32 that is not negative are ordered
     as the float is. The lower half makes them all different."""
     n, k = near.shape
-    keys = torch.empty(k, n, **INDICES)
-    for rows in torch.arange(n, **INDICES).split(1 << 14):  # these fit into a cache
-        here = slice(int(rows[0]), int(rows[-1]) + 1)
-        own, others, me = costs[here], near[here].long(), rows[:, None]
+    everyone, slots = numbers(n, near.device), numbers(k, near.device)
+    keys = everyone.new_empty(k, n)
+    for here in pieces(n, near.device, 1 << 14):  # these fit into a cache
+        own, others, me = costs[here], near[here].long(), everyone[here, None]
         back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
         theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
         slot = back.to(torch.uint8).argmax(2, keepdim=True)
         mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
         once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
         # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
-        hashed = ((me * k + torch.arange(k, **INDICES)) * 2654435761) & 0xFFFFFFFF
+        hashed = ((me * k + slots) * 2654435761) & 0xFFFFFFFF
         key = (once.view(torch.int32).long() << 32) | hashed
         keys[:, here] = key.where(once < math.inf, NEVER).T
     return keys
@@ -117,14 +118,14 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     Returns:
         The state of n - E Gaussians, and which of the n they were.
     """
-    stays = torch.ones(len(state), **FLAGS)
+    stays = torch.ones_like(state.counts, dtype=torch.bool)
     stays[second] = False
     place = stays.cumsum(0) - 1
     place[second] = place[first]
     rows = stays.nonzero()[:, 0]
     after = State(**{name: values.index_select(0, rows) for name, values in vars(state).items()})
-    shares = torch.ones(len(state), **FLOATS)
-    for part in torch.arange(len(first), **INDICES).split(1 << 13):  # these fit into a cache
+    shares = torch.ones_like(state.weights)
+    for part in pieces(len(first), first.device, 1 << 13):  # these fit into a cache
         i, j = first[part], second[part]
         k = place[i]
         (ui, ci, ai), (uj, cj, aj) = (

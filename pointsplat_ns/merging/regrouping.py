@@ -21,14 +21,23 @@ from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import NearestOf
-from pointsplat_ns.merging.covariance import MIN_DIVISOR, covariances_of, outer, pack, rms_area, unpack
+from pointsplat_ns.merging.covariance import (
+    MIN_DIVISOR,
+    covariances_of,
+    diagonals,
+    inverses_and_log_determinants,
+    outer,
+    pack,
+    rms_area,
+    unpack,
+)
 from pointsplat_ns.merging.groups import Groups
 from pointsplat_ns.merging.pairs import growth
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
-from pointsplat_ns.system.pieces import CHUNK, in_pieces
-from pointsplat_ns.system.tensors import DOUBLES, INDICES
+from pointsplat_ns.system.pieces import in_pieces, pieces
+from pointsplat_ns.system.tensors import DOUBLES, add_rows, numbers
 from pointsplat_ns.system.threads import most_threads
 
 
@@ -37,13 +46,13 @@ class Members:
     takes less memory and, by the kernel, little time.
 
     Args:
-        scene: N Gaussians on the CPU.
+        scene: N Gaussians.
         rows: (n,) indices of the members in it.
     """
 
     def __init__(self, scene: Gaussians, rows: Tensor):
         self._scene, self._rows = scene, rows
-        self.masses = torch.empty(len(rows), **DOUBLES)
+        self.masses = torch.empty(len(rows), dtype=torch.float64, device=rows.device)
         """Opacity times root mean square area, (n,)."""
         for these in self.pieces():
             some = rows[these]
@@ -52,7 +61,7 @@ class Members:
 
     def pieces(self) -> Iterator[slice]:
         """All members, in pieces."""
-        return (slice(first, first + CHUNK) for first in range(0, len(self._rows), CHUNK))
+        return pieces(len(self._rows), self._rows.device)
 
     def means(self, these: slice) -> Tensor:
         """Means (m, 3) float64 of a piece, scene units."""
@@ -110,7 +119,7 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
     )
     shares = in_pieces(
         lambda these: common.shares(members.masses[these], group[these]),
-        torch.arange(len(group), **INDICES),
+        numbers(len(group), group.device),
         dtype=torch.float32,
     )
     return Groups(
@@ -125,7 +134,7 @@ def regrouped(participants: Participants, groups: Groups, settings: MergeSetting
 
 def areas_of(cov: Tensor) -> Tensor:
     """Root mean square areas (K,) of covariances (K, 6), computed in pieces."""
-    return in_pieces(lambda these: rms_area(cov[these]), torch.arange(len(cov), **INDICES))
+    return in_pieces(lambda these: rms_area(cov[these]), numbers(len(cov), cov.device))
 
 
 def group_moments(members: Members, group: Tensor, count: int) -> Moments:
@@ -138,19 +147,19 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
     """
 
     def zeros(*shape: int) -> Tensor:
-        return torch.zeros(count, *shape, **DOUBLES)
+        return members.masses.new_zeros(count, *shape)
 
-    mass, sizes = zeros().index_add_(0, group, members.masses), torch.bincount(group, minlength=count)
+    mass, sizes = add_rows(zeros(), group, members.masses), torch.bincount(group, minlength=count)
     found = Moments(mass, sizes, zeros(3), zeros(6), zeros(3))
     for these in members.pieces():
         own = group[these]
         share = found.shares(members.masses[these], own)[:, None]
-        found.means.index_add_(0, own, share * members.means(these))
-        found.colours.index_add_(0, own, share * members.colours(these))
+        add_rows(found.means, own, share * members.means(these))
+        add_rows(found.colours, own, share * members.colours(these))
     for these in members.pieces():
         own = group[these]
         share = found.shares(members.masses[these], own)[:, None]
-        found.cov.index_add_(0, own, share * (members.cov(these) + outer(members.means(these) - found.means[own])))
+        add_rows(found.cov, own, share * (members.cov(these) + outer(members.means(these) - found.means[own])))
     return found
 
 
@@ -173,19 +182,20 @@ def best_groups(
     """
     inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
     occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
-    for some in torch.arange(len(groups.mass), **INDICES).split(CHUNK):
+    for some in pieces(len(groups.mass), groups.mass.device):
         cov = groups.cov[some]
-        variance = cov[:, (0, 3, 5)].mean(1).clamp_min(MIN_DIVISOR)
-        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES)  # invertible if flat
-        inverse[some] = pack(torch.linalg.inv(shapes)) * (occurrences / variance[:, None])
-        log_determinants[some] = torch.logdet(shapes) + 3 * variance.log()
+        variance = diagonals(cov).mean(1).clamp_min(MIN_DIVISOR)
+        shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(cov.device)  # invertible if flat
+        inverses, logs = inverses_and_log_determinants(shapes)
+        inverse[some] = pack(inverses) * (occurrences / variance[:, None])
+        log_determinants[some] = logs + 3 * variance.log()
     colour_weight = 1 / (2 * settings.regrouping_contrast**2)
 
     result, nearest = torch.empty_like(group), NearestOf(groups.means, 6)
     for these in members.pieces():
         means, cov, colours, own = members.means(these), members.cov(these), members.colours(these), group[these]
         near = nearest(means)
-        if KERNELS.usable(compiled):
+        if KERNELS.usable_for(compiled, colours):
             best = torch.empty_like(own)
             task = KERNELS.structs["Choice"](
                 means=means, cov=cov, colours=colours, group=own, near=near.int(), count=len(own),
@@ -202,5 +212,5 @@ def best_groups(
         fit += (colours[:, None] - groups.colours[candidates]).square().sum(2) * colour_weight
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)  # the first of equals
         result[these] = candidates.gather(1, best)[:, 0]
-    heaviest = torch.zeros(len(groups.mass), **DOUBLES).scatter_reduce_(0, group, members.masses, "amax")
+    heaviest = torch.zeros_like(groups.mass).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)

@@ -1,15 +1,18 @@
 """The loop of merging: rounds of pairs until the count is reached, then the scene of what remains.
 
-Everything is computed on one thread each, in pieces that several threads take: the result is the same bits on any
-number of threads, and no thread waits for another within an operation. Besides the scene itself, at most 0.35 kB a
+Everything is computed on the device of the scene. On a CPU, pieces of work take one thread each: the result is the same
+bits on any number of threads, and no thread waits for another within an operation. On a GPU, torch does without kernels
+and rounds in another way; where its memory is too small, the CPU merges. Besides the scene itself, at most 0.35 kB a
 Gaussian are taken; freed blocks are given back to the system before steps that take much.
 """
 
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -28,9 +31,13 @@ from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
-from pointsplat_ns.system.tensors import FLOATS, INDICES
+from pointsplat_ns.system.tensors import numbers
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import Views
+
+logger = logging.getLogger("pointsplat_ns")
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +49,10 @@ class Merged:
     assignment: Tensor  # [N] int64, index in ``scene`` of the Gaussian that each was merged into; -1 if dropped
     size_change: float = 0.0
     """Added to the log-scales of merged Gaussians, chosen by renders."""
+
+    def to(self, device: torch.device) -> Merged:
+        """The same on a device."""
+        return replace(self, scene=self.scene.to(device), assignment=self.assignment.to(device))
 
 
 def merge(
@@ -66,7 +77,7 @@ def merge(
         settings: the tuned numbers.
 
     Returns:
-        Exactly ``k`` Gaussians. Deterministic.
+        Exactly ``k`` Gaussians, on the device of the scene. Deterministic on a CPU.
 
     Raises:
         BudgetError: if ``k`` is not in 1..N, or fewer than ``k`` Gaussians can be drawn.
@@ -107,6 +118,20 @@ def merge_levels(
     return _levels(scene, counts, progress or (lambda share: None), views, settings)
 
 
+def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Result]) -> Result:
+    """The result of a function of a scene; of the scene on the CPU, if a GPU has too little memory for it, or lacks
+    float64."""
+    if scene.device.type == "mps":
+        scene = scene.to("cpu")
+    try:
+        return function(scene)
+    except torch.OutOfMemoryError:
+        if scene.device.type == "cpu":
+            raise
+        logger.warning("%s has too little memory to merge %d Gaussians: the CPU does, slower", scene.device, len(scene))
+    return function(scene.to("cpu"))
+
+
 class Merger:
     """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds before the last one of
     a count, are those of every smaller count as well, and are made once.
@@ -118,17 +143,27 @@ class Merger:
     """
 
     def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
-        self._scene, self._options = scene, (views, settings)
+        self._scene, self._device, self._options = scene, scene.device, (views, settings)
         self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
         """The result of :func:`merge`, to the bit. Arguments and errors as there."""
-        (views, settings), report = self._options, progress or (lambda share: None)
+        report = progress or (lambda share: None)
+
+        def on(scene: Gaussians) -> Merged:
+            if scene is not self._scene:  # it was moved, which the steps before were not
+                self._scene, self._steps = scene, []
+            return self._merged(k, report)
+
+        return _on_cpu_if_too_large(self._scene, on).to(self._device)
+
+    def _merged(self, k: int, report: Callable[[float], None]) -> Merged:
+        views, settings = self._options
         if not self._steps and 1 <= k < len(self._scene):
             self._steps.append(first_step(self._scene, 1, views, settings, report=report))
         if not self._steps or not 1 <= k <= len(self._steps[0].state):  # faint Gaussians are among them
-            return merge(self._scene, k, progress, views, settings)
+            return merge(self._scene, k, report, views, settings)
         step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
         while (n := len(step.state)) > k:
@@ -136,7 +171,7 @@ class Merger:
             step = one_round(step, k, settings)
             self._steps += [step] if shared else []
             report(_share_done(first, len(step.state), k))
-        merged = _result(step, self._scene.device, True, settings)
+        merged = _result(step, True, settings)
         report(1.0)
         return merged
 
@@ -152,10 +187,27 @@ def _levels(
     n = len(scene)
     if n in counts:
         report(0.0 if len(counts) > 1 else 1.0)
-        yield Merged(scene, torch.arange(n, device=scene.device, dtype=torch.int64))
+        yield Merged(scene, numbers(n, scene.device))
         counts = counts[1:]
     if not counts:
         return
+
+    def begun(scene: Gaussians) -> tuple[Merged, Iterator[Merged]]:
+        levels = _merged_levels(scene, counts, report, views, settings)
+        return next(levels), levels
+
+    level, others = _on_cpu_if_too_large(scene, begun)  # the first takes most memory
+    for each in itertools.chain([level], others):
+        yield each.to(scene.device)
+
+
+def _merged_levels(
+    scene: Gaussians,
+    counts: Sequence[int],
+    report: Callable[[float], None],
+    views: Views | Sampler | None,
+    settings: MergeSettings,
+) -> Iterator[Merged]:
     last = counts[-1]
     step = first_step(scene, counts[0], views, settings, last, report)
     first = len(step.state)
@@ -163,7 +215,7 @@ def _levels(
         while len(step.state) > k:
             step = one_round(step, k, settings)
             report(_share_done(first, len(step.state), last))
-        merged = _result(step, scene.device, len(counts) == 1, settings)
+        merged = _result(step, len(counts) == 1, settings)
         if k == last:
             report(1.0)
         yield merged
@@ -200,10 +252,9 @@ def first_step(
 ) -> Step:
     """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`. Nothing is rendered
     if they are no more than the ``last`` count, so that no round follows."""
-    scene = scene.to(device="cpu")
     with one_thread_each():
         participants = Participants.of(scene, drawable(scene, k))
-        found, weights = None, torch.ones(len(participants), **FLOATS)
+        found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
         return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
@@ -244,8 +295,8 @@ def _with_reference(step: Step, settings: MergeSettings) -> Step:
     return replace(step, reference=RendersOfSizes(in_units(dense, *unit), views, [middle_side(views)]))
 
 
-def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSettings) -> Merged:
-    """The result after some rounds, on a device."""
+def _result(step: Step, regroup: bool, settings: MergeSettings) -> Merged:
+    """The result after some rounds."""
     participants, reference = step.participants, step.reference
     with one_thread_each():
         groups, size_change = step.groups(), 0.0
@@ -259,6 +310,6 @@ def _result(step: Step, device: torch.device, regroup: bool, settings: MergeSett
             unit = participants.centre, participants.size
             size_change = best_size_change(lambda change: reference.psnr(in_units(make(change), *unit)))
         scene = make(size_change)
-    assignment = torch.full((len(participants.scene),), -1, **INDICES)
+    assignment = group.new_full((len(participants.scene),), -1)
     assignment[participants.members] = group
-    return Merged(scene.to(device), assignment.to(device), size_change)
+    return Merged(scene, assignment, size_change)

@@ -15,7 +15,7 @@ from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.merging.covariance import covariances_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
-from pointsplat_ns.system.pieces import CHUNK, in_pieces
+from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES
 
 
@@ -23,15 +23,15 @@ from pointsplat_ns.system.tensors import DOUBLES
 class Participants:
     """The Gaussians that are merged, and the scene that they are part of."""
 
-    scene: Gaussians  # N Gaussians on the CPU
+    scene: Gaussians  # N Gaussians; merging computes on their device
     members: Tensor  # [n] int64, indices in the scene, along a space-filling curve: neighbours are near in memory
-    centre: Tensor  # [3] float64, of the scene's content
+    centre: Tensor  # [3] float64, on the CPU, of the scene's content
     size: float
     """Diagonal of the scene's content, scene units."""
 
     @classmethod
     def of(cls, scene: Gaussians, members: Tensor) -> Participants:
-        """The participants ``members`` (n,) of a scene on the CPU."""
+        """The participants ``members`` (n,) of a scene, on its device."""
         order = curve_keys(unit_cells(scene.means[members])).argsort(stable=True)
         return cls(scene, members[order], *content_size(scene))
 
@@ -91,7 +91,7 @@ def initial_state(
         dtype: float64 for a reference, which kernels do not take.
     """
     scene, members = participants.scene, participants.members
-    centre, size = participants.centre.double(), participants.size
+    centre, size = participants.centre.to(members.device, torch.float64), participants.size
     middle, axes = colour_axes or principal_axes(scene, members)
     return State(
         means=in_pieces(lambda rows: (scene.means[rows].double() - centre) / size, members, 3, dtype=dtype),
@@ -101,7 +101,7 @@ def initial_state(
             lambda rows: (_coefficients(scene, rows) - middle) @ axes, members, axes.shape[1], dtype=torch.float32
         ),
         weights=weights.float(),
-        counts=torch.ones(len(members), dtype=torch.int32, device="cpu"),
+        counts=torch.ones_like(members, dtype=torch.int32),
     )
 
 
@@ -123,14 +123,15 @@ def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
     By Parseval's theorem, the coefficients of every band contribute to the mean square over directions as the constant
     does. Eight axes hold nearly all of the variance.
     """
-    pieces = members.split(CHUNK)
     width = 3 + 3 * scene.features_rest.shape[1]
-    shift = _coefficients(scene, pieces[0]).mean(0)  # near the mean, so that float32 holds the squares
-    total, products = torch.zeros(width, **DOUBLES), torch.zeros(width, width, **DOUBLES)
-    for rows in pieces:
-        values = _coefficients(scene, rows) - shift
+    first, *_ = parts = list(pieces(len(members), members.device))
+    shift = _coefficients(scene, members[first]).mean(0)  # near the mean, so that float32 holds the squares
+    total, products = (torch.zeros(*shape, **DOUBLES).to(members.device) for shape in ((width,), (width, width)))
+    for these in parts:
+        values = _coefficients(scene, members[these]) - shift
         total += values.sum(0)
         products += values.T @ values
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
-    return (shift + mean).float(), torch.linalg.eigh(covariance).eigenvectors[:, -8:].float()
+    axes = torch.linalg.eigh(covariance.cpu()).eigenvectors[:, -8:]
+    return (shift + mean).float(), axes.float().to(members.device)

@@ -26,7 +26,7 @@ from pointsplat_ns.looking.traces import trace_factors
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants
 from pointsplat_ns.rasterizer import pixels_of
-from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
+from pointsplat_ns.system.tensors import numbers
 from pointsplat_ns.views import Views
 
 
@@ -56,10 +56,10 @@ def views_and_weights(
             traced = sampler.traced
     report(0.6)
     scene, members = participants.scene, participants.members
-    weights = torch.ones(len(members), **FLOATS)
+    weights = torch.ones_like(members, dtype=torch.float32)
     if found is not None:
         step = -(-len(members) // settings.max_count_drawn)  # one of so many along the curve is drawn for all of them
-        rows = members if step == 1 else torch.arange(-(-len(members) // step), **INDICES)
+        rows = members if step == 1 else numbers(-(-len(members) // step), members.device)
         unit = participants.centre, participants.size
         drawn = in_units(scene if step == 1 else every_nth(scene, members, step), *unit)
         looks = views_in_units(found, *unit)
@@ -78,7 +78,7 @@ def covered_per_area(
     """Covered pixels of some Gaussians over opacity times area, relative to one that is seen well.
 
     Args:
-        scene: N Gaussians on the CPU.
+        scene: N Gaussians.
         rows: (n,) indices, n at least 1.
         views: of the scene, in its own unit.
         settings: ``visibility_views`` and ``min_visibility``.
@@ -87,7 +87,7 @@ def covered_per_area(
     Returns:
         (n,) float32 in [``min_visibility``, 1 / ``min_visibility``]; 1 for all if no view shows enough to tell.
     """
-    covered = torch.zeros(len(scene), **DOUBLES)
+    covered = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     small = views.spread(settings.visibility_views).resized(112)
     small = replace(small, rasterize_mode="antialiased")
     for done, pixels in enumerate(each_view(scene, small, pixels_of)):
@@ -98,5 +98,5 @@ def covered_per_area(
     ratios = covered[rows] / area.clamp_min(torch.finfo(torch.float64).tiny)
     well_seen = ratios.sort().values[int(0.9 * (len(ratios) - 1))]
     if not 0 < float(well_seen) < math.inf:
-        return torch.ones(len(ratios), **FLOATS)
+        return torch.ones_like(ratios, dtype=torch.float32)
     return (ratios / well_seen).clamp(settings.min_visibility, 1 / settings.min_visibility).float()

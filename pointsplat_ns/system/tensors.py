@@ -15,6 +15,20 @@ DOUBLES: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
 INDICES: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
 FLAGS: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
 
+
+def numbers(count: int, device: torch.device) -> torch.Tensor:
+    """0, 1, ... (count,) int64 on a device."""
+    return torch.arange(count, dtype=torch.int64, device=device)
+
+
+def add_rows(total: torch.Tensor, index: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Add values (n, *) to the rows ``index`` (n,) of a total (N, *), and return it: in one order on each device, which
+    ``index_add_`` does not keep on a GPU."""
+    if total.device.type == "cpu":
+        return total.index_add_(0, index, values)
+    return total.index_put_((index,), values, accumulate=True)
+
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 

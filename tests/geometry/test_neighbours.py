@@ -1,11 +1,10 @@
-"""Neighbours and Morton order."""
+"""Nearest neighbours, by either tree."""
 
 import pytest
 import torch
 
-from pointsplat_ns.geometry import neighbours
+from pointsplat_ns.geometry import box_tree, neighbours
 from pointsplat_ns.geometry.neighbours import NearestOf, nearest, other_neighbours
-from pointsplat_ns.geometry.transforms import curve_keys
 
 
 def points(n, d=3, seed=0, dtype=torch.float32):
@@ -27,14 +26,22 @@ def test_the_nearest_are_those_of_brute_force(k, dtype):
     torch.testing.assert_close(distances, wanted_distances, rtol=1e-12, atol=0)  # both in float64
 
 
+@pytest.fixture(params=["scipy", "torch"])
+def tree(request, monkeypatch):
+    """Each of both trees; of torch's, in several pieces, which are halved."""
+    if request.param == "torch":
+        monkeypatch.setattr(neighbours, "_tree_of", box_tree.BoxTree)
+        monkeypatch.setattr(box_tree, "PAIRS_AT_ONCE", 400)
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, scale):
+def test_other_neighbours_are_the_nearest_without_the_point_itself(monkeypatch, scale, tree):
     monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 300)  # several pieces
     where = scale * points(1000).double()
     assert torch.equal(other_neighbours(where, 8).long(), by_brute_force(where, 9)[1][:, 1:])
 
 
-def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
+def test_a_crowd_of_coincident_points_is_linked_all_the_way_through(tree):
     """Their nearest ones alone may be the same few, from which no other is reached."""
     near = other_neighbours(torch.zeros(500, 3, dtype=torch.float64), 4)
     reached = torch.zeros(500, dtype=torch.bool)
@@ -45,7 +52,7 @@ def test_a_crowd_of_coincident_points_is_linked_all_the_way_through():
 
 
 @pytest.mark.parametrize("n", [1, 7, 600])
-def test_the_nearest_of_other_places_are_those_of_brute_force(n):
+def test_the_nearest_of_other_places_are_those_of_brute_force(n, tree):
     where = points(n).double() * torch.tensor([10.0, 1.0, 0.1])
     where[: n // 3] = where[: n // 3].round()  # many coincide in some coordinates
     queries = where + 0.2 * points(n, seed=1).double()
@@ -56,19 +63,20 @@ def test_the_nearest_of_other_places_are_those_of_brute_force(n):
     assert all(len(row.unique()) == min(6, n) for row in near)
 
 
-def test_the_curve_interleaves_the_bits_of_the_grid():
-    generator = torch.Generator().manual_seed(1)
-    cells = torch.rand(200, 3, generator=generator)
-    grid = (cells * (2**20 - 1)).long().tolist()
-    wanted = [
-        sum(((value >> bit) & 1) << (3 * bit + 2 - axis) for bit in range(20) for axis, value in enumerate(point))
-        for point in grid
-    ]
-    assert curve_keys(cells).tolist() == wanted
+def test_the_tree_of_torch_is_exact_for_any_distribution():
+    dense, g = points(2000, dtype=torch.float64), torch.Generator().manual_seed(1)
+    for where in (
+        dense[:, :1] * torch.tensor([1.0, 2.0, 3.0]),  # a line
+        torch.cat([dense, 1e7 + dense[:3]]),  # outliers, fewer than neighbours
+        torch.cat([1e-6 * dense, dense, dense[:1].expand(900, 3)]),
+        dense / torch.rand(2000, 1, generator=g) ** 3,
+    ):
+        found = box_tree.BoxTree(where, 7).nearest(where, 7)[0]
+        torch.testing.assert_close(found, nearest(where, 7)[0], rtol=1e-14, atol=0)  # float64, in another order
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
-def test_where_there_are_fewer_others_a_points_own_index_stands_for_none(n):
+def test_where_there_are_fewer_others_a_points_own_index_stands_for_none(n, tree):
     near = other_neighbours(points(n).double(), 3)
     assert near.shape == (n, 3) and near.dtype == torch.int32 and nearest(points(n), 9)[0].shape == (n, n)
     for own, row in enumerate(near.tolist()):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lab.common.timing import start_of_peak
-from making import assert_same_on_any_threads, box_room, cloud, same_bits
+from making import box_room, cloud, same_bits
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
@@ -91,18 +91,6 @@ def test_cells_lose_no_more_than_the_whole_and_leave_no_seam(tmp_path):
     share = {name: float(beside[rows].float().mean()) for name, rows in nearest.items()}
     assert float(beside.float().mean()) > 0.05
     assert abs(share["parts"] - share["whole"]) < 0.25 * share["whole"] + 0.01, share
-
-
-def test_any_number_of_threads_gives_the_same_bits(tmp_path):
-    rows = rows_of(cloud(1500, seed=8), tmp_path)
-    number = iter(range(9))
-
-    def work() -> list[torch.Tensor]:
-        folder = tmp_path / str(next(number))
-        folder.mkdir()
-        return merged(rows, 250, 500, folder).tensors()
-
-    assert_same_on_any_threads(work)
 
 
 def test_other_work_begins_anew_and_damaged_steps_are_told(tmp_path):

@@ -7,13 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from making import ball, cloud, same, splats, views_from_within
+from making import cloud, same, splats, views_from_within
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.merging import MERGING, Merger, merge, merge_levels
 from pointsplat_ns.merging.groups import deepened
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
-from pointsplat_ns.system.kernels import Kernels
 
 RENDERED = replace(MERGING, min_count_rendered=0, sampled_views=8)
 """Settings with which the smallest scenes are rendered."""
@@ -39,16 +38,6 @@ def test_what_is_merged_with_nothing_is_unchanged_to_the_bit():
     assert same(merged.scene[single], scene[where])
     scene.means[3] = math.nan
     assert same(*(some.map(lambda value: value.nan_to_num(7.0)) for some in (merge(scene, 200).scene, scene)))
-
-
-def test_without_a_compiler_the_same_gaussians_are_merged_but_for_rounding(monkeypatch):
-    scene, settings = ball(400), replace(RENDERED, sampled_views=4, finish_views=1)
-    compiled = merge(scene, 80, settings=settings)
-    monkeypatch.setattr(Kernels, "usable", lambda kernels, wanted: False)
-    by_torch = merge(scene, 80, settings=settings)
-    into = [merged.scene.means[merged.assignment] for merged in (compiled, by_torch)]
-    apart = (into[0] - into[1]).norm(dim=1)
-    assert compiled.size_change != 0 and float((apart < 1e-4).float().mean()) > 0.95
 
 
 def test_deepening_grows_with_the_number_of_members_up_to_opaque():

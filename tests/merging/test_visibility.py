@@ -58,20 +58,16 @@ def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel():
     assert 0.5 < float(found[256:].median() / found[:256].median()) < 2
 
 
-def test_an_occluded_gaussian_has_a_small_weight():
-    front, back = weights_of(two_walls(), of_origin((0, 0, -4))).chunk(2)
-    assert front.dtype == torch.float32 and float(back.median()) < 0.1 * float(front.median())
-
-
-@pytest.mark.parametrize("max_count", [700, 3])  # of more, some are drawn for all
-def test_in_a_large_scene_some_gaussians_are_drawn_for_all(max_count):
+@pytest.mark.parametrize("max_count", [5000, 700, 3])  # of more, some are drawn for all
+def test_an_occluded_gaussian_has_a_small_weight_also_where_some_are_drawn_for_all(max_count):
     scene = two_walls()
     participants = Participants.of(scene, torch.arange(len(scene)))
     _, found = views_and_weights(participants, of_origin((0, 0, -4)), replace(MERGING, max_count_drawn=max_count))
-    assert found.shape == (len(scene),)
+    assert found.shape == (len(scene),) and found.dtype == torch.float32
     front = scene.means[participants.members, 2] < 0
     if max_count > 3:
-        assert float(found[front].mean()) > 1.5 * float(found[~front].mean())
+        times = 10 if max_count == 5000 else 1.5
+        assert float(found[front].median()) > times * float(found[~front].median())
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
