@@ -75,11 +75,12 @@ def prune_source(
     dense, source, photos = _read_photographed(scene, looking, progress, training=False)
     start = time.perf_counter()
     with progress_bar(progress) as report:
-        pruned = prune_scene(dense, request, source, report)
+        pruned = prune_scene(dense.to(default_device()), request, source, report)
+        scene = pruned.scene.to(dense.device)
         seconds = time.perf_counter() - start
     _log_details(pruned.notes, source)
-    _log_held_out(dense, (pruned.scene,), photos)
-    return dense, pruned.scene, seconds, source
+    _log_held_out(dense, (scene,), photos)
+    return dense, scene, seconds, source
 
 
 def clean(

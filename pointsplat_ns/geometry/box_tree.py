@@ -13,9 +13,6 @@ from torch import Tensor
 
 from pointsplat_ns.system.tensors import numbers
 
-PAIRS_AT_ONCE = 1 << 19
-"""Number of pairs of a query and a box that are searched at once; 0.7 GB in a leaf."""
-
 
 class BoxTree:
     """A tree of points.
@@ -24,6 +21,9 @@ class BoxTree:
         points: (N, 3), finite, float32 or float64, on any device; N is at least 1.
         k: largest number of neighbours that is asked for. A leaf has at least as many points, and at least 8.
     """
+
+    PAIRS_AT_ONCE = 1 << 19
+    """Number of pairs of a query and a box that are searched at once; 0.7 GB in a leaf."""
 
     def __init__(self, points: Tensor, k: int):
         n, device = len(points), points.device
@@ -54,7 +54,7 @@ class BoxTree:
         Returns:
             Distances (m, k), and indices (m, k) int64. Of points that are equally far, any may come first.
         """
-        found = [self._nearest(some, k) for some in queries.split(PAIRS_AT_ONCE // 16)]
+        found = [self._nearest(some, k) for some in queries.split(self.PAIRS_AT_ONCE // 16)]
         squares, spots = (torch.cat(parts) for parts in zip(*found, strict=True))
         return squares.sqrt(), self.order[spots]
 
@@ -74,7 +74,7 @@ class BoxTree:
             query, box = query.repeat_interleave(2), torch.stack([2 * box, 2 * box + 1], dim=1).flatten()
             nearer = (self._to_boxes(level, queries[query], box) < most[query]).nonzero()[:, 0]
             query, box = query[nearer], box[nearer]
-            if m > 1 and len(query) > PAIRS_AT_ONCE:
+            if m > 1 and len(query) > self.PAIRS_AT_ONCE:
                 halves = [self._nearest(half, k) for half in queries.split(-(-m // 2))]
                 return torch.cat([half[0] for half in halves]), torch.cat([half[1] for half in halves])
         others = (box != first[query]).nonzero()[:, 0]

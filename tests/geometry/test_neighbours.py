@@ -31,7 +31,7 @@ def tree(request, monkeypatch):
     """Each of both trees; of torch's, in several pieces, which are halved."""
     if request.param == "torch":
         monkeypatch.setattr(neighbours, "_tree_of", box_tree.BoxTree)
-        monkeypatch.setattr(box_tree, "PAIRS_AT_ONCE", 400)
+        monkeypatch.setattr(box_tree.BoxTree, "PAIRS_AT_ONCE", 400)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
