@@ -148,19 +148,22 @@ def _scenes(
 
 def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
     """Photos, each once before any is repeated, and renders of the dense scene; without end."""
-    between = halfway_to_others(torch.stack([photos[index].view.viewmat for index in used]))
     generator = random.Random(0)
     sampled = islice(views.sampled(count=32), 32)
     renders = cycle(Example(view, render(dense, view)) for view in sampled)  # which keeps them
+    some = [used[place] for place in spread_indices(len(used), VIEW_COUNTS.stepped)]
+    between = dict(
+        zip(some, halfway_to_others(torch.stack([photos[index].view.viewmat for index in some])), strict=True)
+    )
     shown, moved = (
-        (place for _ in counted() for place in order.sample(range(len(used)), len(used)))
-        for order in (generator, random.Random(1))
+        (index for _ in counted() for index in order.sample(indices, len(indices)))
+        for indices, order in ((used, generator), (some, random.Random(1)))
     )
 
-    def photo(place: int) -> Example:
+    def photo(index: int) -> Example:
         # In the time of a step on whole photos there are three on 200 pixels, and held-out photos gain 0.4 dB (fox,
         # vr_project).
-        return every_kth_pixel(photos[used[place]], 200, dense.device, generator)
+        return every_kth_pixel(photos[index], 200, dense.device, generator)
 
     for step in counted(1):
         turn, rest = divmod(step, PHOTO_REPAIR.dense_every)
@@ -168,7 +171,7 @@ def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSour
             if rest:
                 example = photo(next(shown))
             elif turn % 2:
-                view = replace(photo(place := next(moved)).view, viewmat=between[place])
+                view = replace(photo(index := next(moved)).view, viewmat=between[index])
                 example = Example(view, render(dense, view))
             else:
                 example = next(renders)
@@ -180,7 +183,8 @@ def halfway_to_others(viewmats: Tensor) -> Tensor:
     one alone stays."""
     rotations, shifts = viewmats[:, :3, :3].double(), viewmats[:, :3, 3:].double()
     centres = -(rotations.mT @ shifts)[..., 0]
-    nearest = torch.cdist(centres, centres).fill_diagonal_(math.inf).argmin(dim=1)
+    apart = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")  # exact far from the origin
+    nearest = apart.fill_diagonal_(math.inf).argmin(dim=1)
     moved = viewmats.clone()
     moved[:, :3, 3] = -(rotations @ (0.5 * (centres + centres[nearest]))[..., None])[..., 0].to(viewmats)
     return moved

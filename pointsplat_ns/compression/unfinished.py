@@ -54,7 +54,8 @@ class Unfinished:
         except (OSError, KeyError, ValueError, SafetensorError) as error:
             logger.warning("%s: damaged (%s); the repair starts again", self._path, one_line(error))
             return None
-        if any((tensors[name].shape, tensors[name].dtype) != (own.shape, own.dtype) for name, own in like.items()):
+        fits = all((tensors[name].shape, tensors[name].dtype) == (own.shape, own.dtype) for name, own in like.items())
+        if count < 1 or not fits:
             return None
         logger.info("%s: the repair continues after %d steps", self._path, count)
         return count, {name: value.to(like[name].device) for name, value in tensors.items()}
