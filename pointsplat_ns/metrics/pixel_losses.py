@@ -7,12 +7,20 @@ from typing import Literal
 
 from torch import Tensor
 
+from pointsplat_ns.system.threads import one_thread
+
 PixelLoss = Literal["l1", "rmse"]
 """Mean absolute difference, or root mean squared difference, which determines the PSNR."""
 
+
+def _rmse(difference: Tensor) -> Tensor:
+    with one_thread():  # the gradient depends on the sum, which more threads round in another way
+        # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
+        return (difference.square().mean() + 1e-12).sqrt()
+
+
 PIXEL_LOSSES: dict[PixelLoss, Callable[[Tensor], Tensor]] = {
     "l1": lambda difference: difference.abs().mean(),
-    # 1e-12 (120 dB) keeps the gradient of the root finite for identical images.
-    "rmse": lambda difference: (difference.square().mean() + 1e-12).sqrt(),
+    "rmse": _rmse,
 }
 """Losses by name, as functions of the difference (H, W, 3) of two images."""

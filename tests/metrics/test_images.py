@@ -7,9 +7,10 @@ import torch
 from pytorch_msssim import SSIM
 
 from making import noisy_pair as pair
-from pointsplat_ns.metrics import ImageError, psnr, psnr_of, ssim
+from pointsplat_ns.metrics import PIXEL_LOSSES, ImageError, psnr, psnr_of, ssim
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.system.kernels import KERNELS
+from pointsplat_ns.system.threads import fixed_threads
 
 
 def test_psnr_of_a_known_error():
@@ -133,3 +134,16 @@ def test_a_pixel_that_is_not_finite_spoils_only_its_windows():
 def test_images_below_the_window_are_said():
     with pytest.raises(ImageError, match="20 x 10 pixels are smaller than SSIM's window; expected at least 11 x 11"):
         ssim(torch.rand(10, 20, 3), torch.rand(10, 20, 3))
+
+
+def test_losses_of_large_pictures_have_the_same_gradients_on_any_number_of_threads():
+    for seed in range(6):  # sums of some of them are rounded in other ways by two or three threads
+        found = []
+        for count in (1, 2, 3):
+            difference = (
+                torch.rand(360, 640, 3, generator=torch.Generator().manual_seed(seed)).sub(0.5).requires_grad_()
+            )
+            with fixed_threads(count):
+                sum(loss(difference) for loss in PIXEL_LOSSES.values()).backward()
+            found.append(difference.grad)
+        assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
