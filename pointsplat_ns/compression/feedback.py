@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
+from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.threads import in_threads, one_thread_each
 
 
@@ -73,14 +74,12 @@ class Feedback(Adam):
         pieces that stay in a core's cache, each on one thread: the result is the same on any number of threads."""
         found = scene.means.new_empty(len(scene), len(PARAMETERS))
 
-        def fill(first: int) -> None:
-            rows = slice(first, first + size)
+        def fill(rows: slice) -> None:
             with torch.no_grad():  # of this thread
                 found[rows] = network(self.features(scene, done, steps, rows)).to(found)
 
-        size = 1 << 12 if scene.device.type == "cpu" else max(len(scene), 1)
         with one_thread_each():
-            in_threads(fill, range(0, len(scene), size), scene.device)
+            in_threads(fill, [*pieces(len(scene), scene.device, 1 << 12)], scene.device)
         return found
 
     @torch.no_grad()

@@ -30,7 +30,7 @@ from pointsplat_ns.compression.repair import OptimisationRun, rate_factor
 from pointsplat_ns.compression.requests import PhotoBudget
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.transforms import rotation_matrices
+from pointsplat_ns.geometry.transforms import invert_rigid, rotation_matrices
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.photos.examples import Example, Photos, every_kth_pixel, mean_psnr
 from pointsplat_ns.pruning import prune
@@ -181,13 +181,12 @@ def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSour
 def halfway_to_others(viewmats: Tensor) -> Tensor:
     """Cameras halfway to their nearest others, each in its own direction: world to camera, (C, 4, 4) as the given ones;
     one alone stays."""
-    rotations, shifts = viewmats[:, :3, :3].double(), viewmats[:, :3, 3:].double()
-    centres = -(rotations.mT @ shifts)[..., 0]
+    poses = invert_rigid(viewmats.double())
+    centres = poses[:, :3, 3]
     apart = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")  # exact far from the origin
     nearest = apart.fill_diagonal_(math.inf).argmin(dim=1)
-    moved = viewmats.clone()
-    moved[:, :3, 3] = -(rotations @ (0.5 * (centres + centres[nearest]))[..., None])[..., 0].to(viewmats)
-    return moved
+    poses[:, :3, 3] = 0.5 * (centres + centres[nearest])
+    return invert_rigid(poses).to(viewmats)
 
 
 @torch.no_grad()

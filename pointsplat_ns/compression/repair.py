@@ -78,7 +78,11 @@ def repair(
     feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
     work = len(dense), budget, psnr, views.compared().viewmats.tolist()
     file = Unfinished(None if budget.seconds is not None else unfinished, scene, work)
-    found = file.state({**feedback.state(), **dict(scene.items())})
+
+    def state_of(scene: Gaussians) -> dict[str, Tensor]:
+        return {**feedback.state(), **dict(scene.items())}
+
+    found = file.state(state_of(scene))
     if found is not None:
         run.count, state = found
         run.done = budget.share_done(run.count, 0.0)
@@ -97,7 +101,7 @@ def repair(
 
     def kept(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
         for count, scene in enumerate(scenes, first + 1):
-            file.save(count, lambda scene=scene: {**feedback.state(), **dict(scene.items())})  # type: ignore[misc]
+            file.save(count, functools.partial(state_of, scene))
             yield scene
 
     examples = _examples(dense, views, budget.growth, run.count)

@@ -192,33 +192,25 @@ def _levels(
     if not counts:
         return
 
+    def merged_levels(scene: Gaussians) -> Iterator[Merged]:
+        step = first_step(scene, counts[0], views, settings, counts[-1], report)
+        first = len(step.state)
+        for k in counts:
+            while len(step.state) > k:
+                step = one_round(step, k, settings)
+                report(_share_done(first, len(step.state), counts[-1]))
+            merged = _result(step, len(counts) == 1, settings)
+            if k == counts[-1]:
+                report(1.0)
+            yield merged
+
     def begun(scene: Gaussians) -> tuple[Merged, Iterator[Merged]]:
-        levels = _merged_levels(scene, counts, report, views, settings)
+        levels = merged_levels(scene)
         return next(levels), levels
 
     level, others = _on_cpu_if_too_large(scene, begun)  # the first takes most memory
     for each in itertools.chain([level], others):
         yield each.to(scene.device)
-
-
-def _merged_levels(
-    scene: Gaussians,
-    counts: Sequence[int],
-    report: Callable[[float], None],
-    views: Views | Sampler | None,
-    settings: MergeSettings,
-) -> Iterator[Merged]:
-    last = counts[-1]
-    step = first_step(scene, counts[0], views, settings, last, report)
-    first = len(step.state)
-    for k in counts:
-        while len(step.state) > k:
-            step = one_round(step, k, settings)
-            report(_share_done(first, len(step.state), last))
-        merged = _result(step, len(counts) == 1, settings)
-        if k == last:
-            report(1.0)
-        yield merged
 
 
 def _share_done(first: int, now: int, last: int) -> float:

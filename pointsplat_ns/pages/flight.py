@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.geometry.transforms import invert_rigid
 from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.looking.content import content_size, in_units, views_in_units
 from pointsplat_ns.looking.opening import opening_views
@@ -78,7 +79,7 @@ class FlightFrame:
     def data(self, packed: Sequence[dict[str, str]]) -> dict[str, Any]:
         """Data for ``flight.js``, from results of :meth:`packed` for one or two scenes; the first is on the left."""
         fov = 2 * torch.atan(0.5 * max(self.views.width, self.views.height) / self.views.Ks[:, 0, 0].abs())
-        eyes = -(self.views.viewmats[:, :3, :3].mT @ self.views.viewmats[:, :3, 3:])[..., 0]
+        eyes = invert_rigid(self.views.viewmats)[:, :3, 3]
         return {
             "scenes": list(packed),
             "views": [
