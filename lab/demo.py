@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shlex
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +18,8 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.printing import start as run_program
-from pointsplat_ns.errors import PointSplatError, need
+from lab.common.running import run as run_command
+from pointsplat_ns.errors import need
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import flip_camera_axes, invert_rigid
 from pointsplat_ns.io.files import need_folder
@@ -29,7 +27,6 @@ from pointsplat_ns.io.pictures import write_picture
 from pointsplat_ns.io.runs import METHOD_NAMES
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.metrics.lpips import WEIGHTS_VARIABLE
-from pointsplat_ns.nerfstudio_plugin.registration import JIT_SCRIPT
 from pointsplat_ns.system.progress import tracked
 from pointsplat_ns.system.tensors import FLOATS
 from pointsplat_ns.system.terminal import print_table
@@ -173,31 +170,14 @@ def write_capture(scene: ps.Gaussians, folder: Path) -> None:
 
 
 def run(about: str, words: list[Any], log: Path) -> None:
-    """Say what a command does, print it, run it, and print the seconds that it took. Its standard output goes to a
-    file. If this is interrupted, the command is ended.
-
-    Raises:
-        PointSplatError: if the command fails.
-    """
+    """Say what a command does, run it, and print the seconds that it took. Its standard output goes to a file. Raises
+    PointSplatError if the command fails."""
 
     start = time.perf_counter()
-    program, *arguments = map(str, words)
-    command = shlex.join([program, *arguments])
-    print(f"\n{about}\n$ {command}", flush=True)
-    beside = Path(sys.executable).parent / program
-    environment = {
-        # Threads that wait for one another spin briefly and then sleep: much faster where other programs run as well.
-        "GOMP_SPINCOUNT": "20000",
-        "PYTHONWARNINGS": JIT_SCRIPT,
-        # Nothing is there: LPIPS is left out, whose weights are a download of 233 MB.
-        WEIGHTS_VARIABLE: str(log.with_name("no_lpips_weights")),
-        **os.environ,
-    }
-    with log.open("wb") as stream:
-        done = subprocess.run([str(beside) if beside.exists() else program, *arguments], env=environment, stdout=stream)
-    if done.returncode != 0:
-        where = f"what it said is above and in {log}"
-        raise PointSplatError(f"{command}: ended with exit status {done.returncode}; {where}")
+    print(f"\n{about}", end="")
+    # Nothing is there: LPIPS is left out, whose weights are a download of 233 MB.
+    no_lpips = {WEIGHTS_VARIABLE: str(log.with_name("no_lpips_weights"))}
+    run_command(shlex.join(map(str, words)), log, show_errors=True, **no_lpips)
     print(f"{time.perf_counter() - start:.0f} s")
 
 

@@ -4,7 +4,7 @@ import json
 import math
 import signal
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ import pytest
 import quick_start.sitecustomize  # noqa: F401  (before nerfstudio)
 import torch
 
-from making import SHARED_DATA, ball, small_config
+from browser import chromium
+from making import SHARED_DATA, ball, losses_of, small_config
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.views import Views
@@ -71,14 +72,7 @@ def run_training() -> Callable:
         config.save_config()
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
-        losses, iteration = [], trainer.train_iteration
-
-        def recorded(step):
-            result = iteration(step)
-            losses.append(result[0].item())
-            return result
-
-        trainer.train_iteration = recorded
+        losses = losses_of(trainer)
         with warnings.catch_warnings():
             # torch: "lr_scheduler.step() before optimizer.step()", because it does not see the gradient scaler's step
             warnings.filterwarnings("ignore", category=UserWarning, module="torch.optim.*")
@@ -178,6 +172,13 @@ def hollow_ball(make_hollow_ball) -> Gaussians:
 def ball_views(hollow_ball: Gaussians) -> Views:
     """Four small views from within."""
     return sample_views(hollow_ball, 4, 64, 48)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
+    """A headless Chromium."""
+    with chromium() as opened:
+        yield opened
 
 
 @pytest.fixture(autouse=True)

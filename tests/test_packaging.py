@@ -116,13 +116,6 @@ def modules_after(code: str) -> set[str]:
     return set(json.loads(done.stdout))
 
 
-def test_importing_the_package_imports_only_the_standard_library():
-    imported = modules_after("import pointsplat_ns")
-    packages = {name.split(".")[0] for name in imported}
-    assert packages - set(sys.stdlib_module_names) == {"pointsplat_ns"}
-    assert {name for name in imported if name.startswith("pointsplat_ns")} == {"pointsplat_ns"}
-
-
 def test_the_core_never_imports_nerfstudio_nor_what_only_pictures_need(tmp_path):
     ps.save(ball(200, opacity=1.0, bright=1.0), tmp_path / "room.ply")
     code = f"""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from pointsplat_ns.io.files import replacing
+from pointsplat_ns.io.files import json_text, replacing
 
 Row = dict[str, Any]
 
@@ -21,10 +21,10 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Write a JSON file whole or not at all; no path, no file."""
+    """Write a JSON file whole or not at all, with null for numbers that are not finite; no path, no file."""
     if path is not None:
         with replacing(path) as part:
-            part.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+            part.write_text(json_text(content) + "\n", "utf-8")
 
 
 class Results:

@@ -1,4 +1,4 @@
-"""Command lines of ``ns-train``, and their running. nerfstudio is not imported."""
+"""Command lines of ``ns-train``, and the running of commands. nerfstudio is not imported."""
 
 from __future__ import annotations
 
@@ -14,21 +14,32 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.registration import JIT_SCRIPT
 
 
-def run(command: str, log: Path) -> None:
-    """Print a command and run it, with the program from this Python's environment; a file gets its output. If this is
-    interrupted, the command is ended first. Raises PointSplatError if the command fails."""
+def run(command: str, log: Path, show_errors: bool = False, **variables: str) -> None:
+    """Print a command and run it, with the program from this Python's environment. If this is interrupted, the command
+    is ended first.
+
+    Args:
+        command: the command line.
+        log: file for its output.
+        show_errors: leave its standard error on the terminal.
+        variables: of its environment, where they are not set.
+
+    Raises:
+        PointSplatError: if the command fails.
+    """
     print(f"\n$ {command}", flush=True)
     program, *arguments = shlex.split(command)
     beside = Path(sys.executable).parent / program
     words = [str(beside) if beside.exists() else program, *arguments]
     # Waiting OpenMP threads spin for some microseconds, then sleep. By default they keep spinning, which on a busy
     # machine slows the thread that they wait for. Threads that sleep at once (OMP_WAIT_POLICY=PASSIVE) wake too late.
-    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": JIT_SCRIPT, **os.environ}
+    environment = {"GOMP_SPINCOUNT": "20000", "PYTHONWARNINGS": JIT_SCRIPT, **variables, **os.environ}
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as stream:
-        status = _status(words, env=environment, stdout=stream, stderr=subprocess.STDOUT)
+        status = _status(words, env=environment, stdout=stream, stderr=None if show_errors else subprocess.STDOUT)
     if status != 0:
-        raise PointSplatError(f"{command}: ended with exit status {status}; what it said is in {log}")
+        where = "above and in" if show_errors else "in"
+        raise PointSplatError(f"{command}: ended with exit status {status}; what it said is {where} {log}")
 
 
 def _status(words: list[str], **options: Any) -> int:

@@ -23,9 +23,6 @@ JUDGED = (
 )
 """Scenes that no constant is chosen on: they were named before the first measurement. See docs/benchmarks.md."""
 
-KEEP = 0.1
-"""Share of a scene that is kept where one share is timed."""
-
 
 def group_of(scene: str) -> str:
     """ "tuning", "judged", or "" for any other scene."""

@@ -33,9 +33,7 @@ def seconds_of(call: Callable[[], object]) -> float:
     return now() - start
 
 
-def timed(
-    functions: dict[Any, Callable[[], dict[Any, float]]], repeats: int, budget: float, fastest: bool = False
-) -> dict[Any, float]:
+def timed(functions: dict[Any, Callable[[], dict[Any, float]]], repeats: int, budget: float) -> dict[Any, float]:
     """Call every function once a round and take medians, so that a busy moment of the machine hits all alike.
 
     Args:
@@ -43,7 +41,6 @@ def timed(
         repeats: rounds counted; one more comes before them, to warm up.
         budget: seconds after which no new round is begun. At least one round is counted: the first if it alone
             took more than half of the budget.
-        fastest: take the fastest round of each figure in place of the median.
     """
     begin = time.perf_counter()
     rounds: list[dict[Any, float]] = []
@@ -56,8 +53,7 @@ def timed(
             rounds.append(seconds)
         if rounds and spent + spent / (i + 1) > budget:
             break
-    choose = min if fastest else statistics.median
-    return {name: choose([r[name] for r in rounds]) for name in rounds[0]}
+    return {name: statistics.median([r[name] for r in rounds]) for name in rounds[0]}
 
 
 def start_of_peak() -> None:

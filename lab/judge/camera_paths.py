@@ -12,13 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from PIL import Image, ImageDraw
 from torch import Tensor
 
-from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.looking.poses import look_at
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.views import Views
 
 FOLDER = Path(__file__).parent / "paths"
@@ -32,9 +28,6 @@ NEAR_PLANE = 1e-3
 
 FIELDS_OF_VIEW = (20.0, 120.0)
 """Degrees across the width that a path may ask for; beyond these it is more likely a mistake."""
-
-SHEET = 320, 4
-"""Width of a picture on a contact sheet, pixels, and pictures in a row."""
 
 
 @dataclass(frozen=True)
@@ -111,29 +104,3 @@ def views_of(path: Path, width: int) -> Views:
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
     near = NEAR_PLANE * float((found.ats - found.eyes).norm(dim=1).median())
     return Views(viewmats, K.repeat(len(viewmats), 1, 1), width, height, torch.zeros(3), near_plane=near)
-
-
-@torch.no_grad()
-def write_sheet(scene: Gaussians, path: Path, target: Path) -> None:
-    """Draw all views of a path, small, as one PNG.
-
-    Args:
-        scene: the scene of the path.
-        path: the JSON file of the path.
-        target: the PNG to write.
-
-    Raises:
-        SystemExit: if the file is not a path.
-    """
-    width, across = SHEET
-    views = views_of(path, width)
-    rows = math.ceil(len(views) / across)
-    sheet = Image.new("RGB", (across * views.width, rows * views.height))
-    draw = ImageDraw.Draw(sheet)
-    for number, view in enumerate(views):
-        corner = (number % across * views.width, number // across * views.height)
-        pixels = (255 * render(scene, view)).round().to(torch.uint8).numpy()
-        sheet.paste(Image.fromarray(pixels), corner)
-        draw.text((corner[0] + 3, corner[1] + 2), str(number), fill=(255, 255, 0))
-    with replacing(target) as part:
-        sheet.save(part, format="PNG")

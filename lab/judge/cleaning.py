@@ -16,13 +16,12 @@ from typing import Annotated
 
 import torch
 import tyro
-from torch import Tensor
-from torch.nn.functional import interpolate
 
 import pointsplat_ns as ps
 from lab.common.compare import metrics_of, photos_of
 from lab.common.printing import console, number, start, table
 from lab.common.scenes import group_of
+from lab.tables.scenes import Pictures
 from pointsplat_ns.compression.cleaning import floating_scores
 from pointsplat_ns.nerfstudio_plugin.dataset_views import view_source
 from pointsplat_ns.rasterizer import render
@@ -50,14 +49,13 @@ def main(
     """
     for run in runs:
         dense = ps.load(run)
-        name, views, whole = photos_of(run, "test", photos)
-        views = views.resized(side)
-        size = views.height, views.width
-        targets = [interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0) for photo in whole]
+        name, *whole = photos_of(run, "test", photos)
+        held_out = Pictures(*whole).resized(side)
 
-        def measured(scene: ps.Gaussians, views: ps.Views = views, targets: list[Tensor] = targets) -> dict[str, list]:
-            pairs = [metrics_of(render(scene, view), target, None) for view, target in zip(views, targets, strict=True)]
-            return {key: [pair[key] for pair in pairs] for key in ("psnr", "ssim")}
+        def measured(scene: ps.Gaussians, held_out: Pictures = held_out) -> dict[str, list]:
+            pairs = zip(held_out.views, held_out.photos or (), strict=True)
+            found = [metrics_of(render(scene, view), photo, None) for view, photo in pairs]
+            return {key: [metrics[key] for metrics in found] for key in ("psnr", "ssim")}
 
         before = measured(dense)
         source = view_source(dense, run=None if sampled else run)
@@ -69,7 +67,7 @@ def main(
             changes = map(number(3, sign="+"), (mean(psnr), min(psnr), max(psnr), mean(ssim)))
             rows.append([f"{strength:g}", number(2)(100 * float((scores < strength).double().mean())), *changes])
         heads = ("strength", "removed, %", "PSNR, dB", "worst photo", "best photo", "SSIM")
-        title = f"{name} ({group_of(name)}): {mean(before['psnr']):.2f} dB in {len(views)} held-out photos"
+        title = f"{name} ({group_of(name)}): {mean(before['psnr']):.2f} dB in {len(held_out.views)} held-out photos"
         console().print(table(title, heads, rows))
 
 

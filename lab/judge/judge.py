@@ -28,18 +28,23 @@ from lab.common.programs import ProgramFailed
 from lab.common.results import Results, Row
 from lab.common.scenes import JUDGED, TUNING, group_of
 from lab.common.ways import WAYS, Reducer, Way, count_of, programs_of
-from lab.judge.camera_paths import path_of, write_sheet
+from lab.judge.camera_paths import path_of, views_of
 from lab.judge.record import Figures, at_order, section
 from lab.judge.scenes import MEASURES, JudgedScene, check, check_options, known_rows, load, losses
+from pointsplat_ns.compression.pictures import plot_views
 from pointsplat_ns.errors import SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.metrics.lpips import Lpips
 from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.view_source import ViewSource
 
 Task = tuple[float, Reducer]
 """A share of the Gaussians to keep, and what makes the scene smaller."""
 
+
+SHEET_WIDTH = 320
+"""Width of a picture on a contact sheet, pixels."""
 
 COSTS = ("seconds", "cpu_seconds", "peak_bytes")
 """What making a scene smaller took."""
@@ -151,10 +156,10 @@ def scene_list() -> Table:
 def write_sheets(scenes: tuple[Path, ...], folder: Path) -> None:
     """Draw the views of each scene's path into a folder, one PNG a scene."""
     folder.mkdir(parents=True, exist_ok=True)
-    for scene in scenes:
-        target = folder / f"{scene.stem}.png"
-        write_sheet(read_scene(scene), path_of(scene.stem), target)
-        print(target, flush=True)
+    for path in scenes:
+        scene = read_scene(path)
+        source = ViewSource(scene, views_of(path_of(path.stem), SHEET_WIDTH))
+        print(plot_views(scene, source, folder / f"{path.stem}.png"), flush=True)
 
 
 @torch.no_grad()

@@ -61,18 +61,10 @@ def main(
         small = ps.prune(finest, count)
         judge("prune", small, time.process_time() - begin)
     write_json(json_path, rows)
-    dB = number(1)
+    tenths = number(1)
     columns = [f"{what}_{width}" for width in widths for what in ("mean", "worst")]
-    lines = [
-        (
-            row["way"],
-            f"{row['count']:,}",
-            *(dB(row[column]) for column in columns),
-            dB(row["cpu_seconds"]),
-            dB(row["peak_gb"]),
-        )
-        for row in rows
-    ]
+    figures = (*columns, "cpu_seconds", "peak_gb")
+    lines = [(row["way"], f"{row['count']:,}", *(tenths(row[name]) for name in figures)) for row in rows]
     title = f"{stream}: {len(finest):,} Gaussians, PSNR in {len(views[widths[0]])} views, dB"
     console().print(table(title, ("", "Gaussians", *columns, "CPU s", "GB"), lines))
 

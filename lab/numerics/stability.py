@@ -9,7 +9,6 @@ that of the arithmetic. The truth of images and gradients is the package's per-p
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -46,17 +45,12 @@ def main(
     rows: list[Row] = []
     for sweep, value in tracked(cases, "measuring", len(cases)):
         rows += measured(sweep, value, compiled and not KERNELS.why_missing)
-        errors = [{name: _json(value) for name, value in asdict(row).items()} for row in rows]
-        write_json(output / "stability.json", {"torch": torch.__version__, "trusted": TRUSTED, "errors": errors})
+        errors = {"torch": torch.__version__, "trusted": TRUSTED, "errors": list(map(asdict, rows))}
+        write_json(output / "stability.json", errors)
     plot(rows, output)
     print(f"trusted up to a relative error of {TRUSTED}; torch {torch.__version__}, {torch.get_num_threads()} threads")
     print(f"{len(rows)} errors in {time.perf_counter() - started:.0f} s; in brackets the largest\n")
     print(tables(rows))
-
-
-def _json(value: object) -> object:
-    """JSON has no infinity: null stands for what is not finite."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 if __name__ == "__main__":

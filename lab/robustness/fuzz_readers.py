@@ -12,7 +12,7 @@ import io
 import json
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from pkgutil import resolve_name
 from unittest import mock
@@ -124,7 +124,8 @@ def gsplat_bytes(scene: Gaussians) -> bytes:
     return _saved({"step": 1, "splats": values})
 
 
-def _zip_of(parts: dict[str, bytes]) -> bytes:
+def zip_of(parts: Mapping[str, bytes | str]) -> bytes:
+    """A zip archive of files by their names."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, part in parts.items():
@@ -137,7 +138,7 @@ def _pickle_in(checkpoint: bytes) -> Make:
     with zipfile.ZipFile(io.BytesIO(checkpoint)) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     [pickle] = (name for name in parts if name.endswith("/data.pkl"))
-    return at("a.ckpt", _scene, inside=lambda data: _zip_of(parts | {pickle: data}))
+    return at("a.ckpt", _scene, inside=lambda data: zip_of(parts | {pickle: data}))
 
 
 READERS |= {

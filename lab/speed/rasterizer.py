@@ -114,7 +114,7 @@ def _spans(marks: list[float], names: list[str]) -> dict[str, float]:
     return {name: b - a for name, a, b in zip(names, marks, marks[1:], strict=False)}
 
 
-def measured(case: Case, variants: tuple[str, ...], repeats: int, budget: float, fastest: bool) -> Row:
+def measured(case: Case, variants: tuple[str, ...], repeats: int, budget: float) -> Row:
     """Seconds, errors and counts of one case."""
     errors = {}
     with torch.no_grad():
@@ -123,7 +123,7 @@ def measured(case: Case, variants: tuple[str, ...], repeats: int, budget: float,
             image = case.draw(name)[0].clamp(0, 1)
             errors |= {f"{name} max": float((image - exact).abs().max()), f"{name} PSNR": float(psnr(image, exact))}
     functions = {name: partial(case.time_variant, name) for name in variants} | {"blending": case.time_blending}
-    seconds = timed(functions, repeats, budget, fastest)
+    seconds = timed(functions, repeats, budget)
     visible, pairs = case.drawn()
     row: Row = {"gaussians": len(case.tensors[0]), "width": case.width, "height": case.height}
     return row | {"visible": visible, "pairs": pairs, "seconds": seconds, "errors": errors}
@@ -169,7 +169,6 @@ def main(
     variants: tuple[str, ...] = ("compiled", "eager", "balanced", "fast"),
     repeats: int = 5,
     budget: float = 8.0,
-    fastest: bool = False,
     cpu_time: bool = False,
     json: Path | None = None,
 ) -> None:
@@ -181,8 +180,7 @@ def main(
         variants: eager, compiled, balanced, fast; the first is the base of all ratios.
         repeats: rounds; medians are reported.
         budget: seconds a case may take before it is content with fewer rounds.
-        fastest: report the fastest round of each figure in place of the median, for a busy machine.
-        cpu_time: count CPU seconds of one thread in place of wall time: steadier still on a busy machine.
+        cpu_time: count CPU seconds of one thread in place of wall time: steadier on a busy machine.
         json: write all figures here, after each case.
     """
     unknown = [name for name in variants if name not in VARIANTS]
@@ -196,7 +194,7 @@ def main(
     rows: list[Row] = []
     for count in gaussians:
         for width, height in map(_size_of, sizes):
-            rows.append(measured(Case(count, width, height), variants, repeats, budget, fastest))
+            rows.append(measured(Case(count, width, height), variants, repeats, budget))
             settings = {"torch": torch.__version__, "threads": torch.get_num_threads(), "clock": clock}
             write_json(json, settings | {"cases": rows})
     show(rows, variants)

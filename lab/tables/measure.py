@@ -36,6 +36,7 @@ from pointsplat_ns.metrics import MOST_PSNR
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.progress import tracked
+from pointsplat_ns.tradeoff.measuring import machine_text
 from pointsplat_ns.views import View
 
 ROUNDS = 3
@@ -195,9 +196,10 @@ def _about(path: Path, data: Path | None, options: Options) -> Row:
             dataset = paper_dataset(open_run(path, data=data))
         except SceneError:  # its data is gone
             pass
-    about: Row = {"name": name_of(path), "path": str(path), "dataset": dataset, "machine": machine_text()}
+    machine = machine_text(torch.device("cpu"))
+    about: Row = {"name": name_of(path), "path": str(path), "dataset": dataset, "machine": machine}
     asked = {name: value for name, value in asdict(options).items() if name != "fine_tune"}
-    return about | {"of": {"file": source_file(path).sha256, "machine": machine_text(), **asked}}
+    return about | {"of": {"file": source_file(path).sha256, "machine": machine, **asked}}
 
 
 def _groups(groups: Sequence[str], names: dict[str, Path]) -> dict[str, str]:
@@ -250,11 +252,3 @@ def source_commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return ""
     return found[0][:12] + ("+" if found[1] else "")
-
-
-def machine_text() -> str:
-    """Processor, number of threads and version of torch, as text."""
-    lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
-    processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "CPU")
-    threads = torch.get_num_threads()
-    return f"{processor}, {threads} thread{'s' if threads != 1 else ''}, cpu, torch {torch.__version__}"

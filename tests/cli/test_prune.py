@@ -10,7 +10,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-import torch
 from refusing import refusal, run
 
 import pointsplat_ns as ps
@@ -29,20 +28,6 @@ SEED = 5
 def ply(tmp_path) -> Path:
     write_ply(normal_scene(80, seed=SEED), tmp_path / "scene.ply")
     return tmp_path / "scene.ply"
-
-
-def test_prune_refuses_what_is_no_scene(ply, tmp_path, capsys):
-    half = tmp_path / "half.ply"
-    half.write_bytes(ply.read_bytes()[:-100])
-    write_ply(normal_scene(3, seed=SEED).map(lambda value: value * torch.nan), tmp_path / "nothing.ply")
-    for words, said in (
-        ([tmp_path / "gone.ply"], "gone.ply: no such file"),
-        ([half], "half.ply"),
-        ([tmp_path / "nothing.ply"], "holds no Gaussians"),
-        ([ply, "--by", "paper", "--opacity-weight", 2], "opacity_weight is 2.0; expected 0 to 1"),
-        ([ply, "--by", "authors", "--opacity-weight", 2], "opacity_weight is 2.0; expected 0 to 1"),
-    ):
-        assert said in refusal(capsys, tmp_path, "prune", *words, "-o", tmp_path / "out.ply")
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog"])

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -192,9 +193,8 @@ def inria_with(**changes) -> list:
 )  # fmt: skip
 def test_other_json_is_refused_in_one_line(content, message, tmp_path):
     path = written(content, tmp_path / "cameras.json")
-    with pytest.raises(ps.DataError, match=message) as raised:
-        read_views(path)
-    assert str(raised.value).startswith(str(path)) and "\n" not in str(raised.value) and len(str(raised.value)) < 600
+    said = fails(lambda: read_views(path), error=ps.DataError)
+    assert said.startswith(str(path)) and re.search(message, said)
 
 
 def damaged(file: str, change) -> Callable[[Path], Path]:
@@ -243,9 +243,8 @@ POINTS_AT = NAME_AT + len(name_of(0)) + 1
 )
 def test_damaged_colmap_models_are_refused_in_one_line(write, message, tmp_path):
     folder = write(tmp_path / "sparse")
-    with pytest.raises(ps.DataError, match=message) as raised:
-        read_views(folder)
-    assert str(raised.value).startswith(str(folder)) and "\n" not in str(raised.value)
+    said = fails(lambda: read_views(folder), error=ps.DataError)
+    assert said.startswith(str(folder)) and re.search(message, said)
 
 
 def test_points_take_no_memory(tmp_path):

@@ -4,7 +4,6 @@ import gzip
 import io
 import logging
 import struct
-import zipfile
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from plys import columns_of, write_columns
 from refusing import fails
 
 import pointsplat_ns as ps
+from lab.robustness.fuzz_readers import zip_of
 from making import SHARED_DATA, cloud, normal_scene, same_bits, write_run
 from pointsplat_ns.io.discovery import find_scenes
 from pointsplat_ns.io.formats import format_like, format_named, format_to_read
@@ -23,14 +23,6 @@ from pointsplat_ns.io.formats.spz import encode_spz
 from pointsplat_ns.io.scene import kind_of, source_file
 
 SCENE = cloud(64, 3, 1)
-
-
-def zip_of(**files):
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return stream.getvalue()
 
 
 def torch_bytes(content, **options):
@@ -100,11 +92,11 @@ def test_a_folder_is_searched_by_what_its_files_hold(tmp_path, contents, caplog)
 
 
 REFUSED = {
-    "x.ply": (zip_of(**{"document.json": "{}", "splat_0.ply": "ply\n"}), "SuperSplat project files are not read; open"),
+    "x.ply": (zip_of({"document.json": "{}", "splat_0.ply": "ply\n"}), "SuperSplat project files are not read; open"),
     "x.ssproj": (b"anything", "SuperSplat project"),
-    "x.zip": (zip_of(**{"lod-meta.json": "{}", "0_0/meta.json": "{}"}), "zip of a streamed SOG"),
+    "x.zip": (zip_of({"lod-meta.json": "{}", "0_0/meta.json": "{}"}), "zip of a streamed SOG"),
     "x.sog": (
-        zip_of(**dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), b"")),
+        zip_of(dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), b"")),
         "a zip archive of a.jpg, b.jpg, c.jpg and 1",
     ),
     "x.lcc": (b"{}", "LCC files are not read; convert it"),
@@ -113,8 +105,8 @@ REFUSED = {
     "y.ply": (b"<!DOCTYPE html><html>", "web page"),
     "y.splat": (b"LASF" + bytes(60), "LAS point cloud"),
     "z.ply": (b"PXR-USDC" + bytes(60), "USD files are not read"),
-    "y.zip": (zip_of(**{"room/a.ply": "ply\n"}), "zip of a PLY files are not read; unpack it and name the PLY"),
-    "z.zip": (zip_of(**{"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
+    "y.zip": (zip_of({"room/a.ply": "ply\n"}), "zip of a PLY files are not read; unpack it and name the PLY"),
+    "z.zip": (zip_of({"a.ply": "ply\n" * 99})[:-30], "a zip archive that is truncated or damaged"),
     "z.splat": (b"# a text of words and numbers 32\n" * 32, "text"),
     "z.spz": (gzip.compress(b"ply\nformat ascii 1.0\n"), "SPZ of b'ply\\n'"),
     "x.glb": (b"glTF" + bytes(60), "glTF files are not read; export the scene"),

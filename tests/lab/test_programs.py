@@ -2,6 +2,7 @@
 
 import sys
 
+import psutil
 import pytest
 
 from lab.common.programs import ProgramFailed, run_measured
@@ -35,3 +36,13 @@ def test_peak_memory_is_the_childs_own_and_not_its_parents():
 def test_a_program_that_fails_is_an_error_with_what_it_said_in_one_line(command, said):
     with pytest.raises(ProgramFailed, match=said):
         run_measured(command)
+
+
+def test_a_program_that_takes_too_long_is_killed_with_all_that_it_started(tmp_path):
+    def running() -> list[psutil.Process]:
+        return [p for p in psutil.process_iter(["cmdline"]) if str(tmp_path) in (p.info["cmdline"] or ())]
+
+    with pytest.raises(ProgramFailed, match="took more than 2 s and was ended"):
+        run_measured([*python("import time; time.sleep(600)"), str(tmp_path)], timeout=2.0)
+    psutil.wait_procs(running(), timeout=30)  # the system takes a moment
+    assert not running()

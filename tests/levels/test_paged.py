@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from nested_levels import nested, rows_of
+from refusing import refusal, run
 
 import pointsplat_ns as ps
 from making import ball, normal_scene
-from pointsplat_ns.cli import main
 from pointsplat_ns.geometry.harmonics import SH_C0
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.io.formats import rad
@@ -135,14 +135,12 @@ def test_more_children_than_the_format_counts_are_refused(tmp_path):
 
 def test_the_command_writes_a_file_and_replaces_one_only_by_force(tmp_path, capsys):
     ps.save(ball(200, opacity=1.0, bright=1.0), tmp_path / "room.ply")
-    command = ["lod", str(tmp_path / "room.ply"), "--levels", "10%", "-o", str(tmp_path / "a.rad"), "--resolution",
-               "48x36"]  # fmt: skip
-    main(command)
+    words = ("lod", tmp_path / "room.ply", "--levels", "10%", "-o", tmp_path / "a.rad", "--resolution", "48x36")
+    run(*words)
     written = (tmp_path / "a.rad").read_bytes()
     head, table = read_rad(written)
     assert int((table["child_count"] == 0).sum()) == 200 and head["count"] > 220
-    with pytest.raises(SystemExit):
-        main(command)
-    assert "a.rad: exists already" in capsys.readouterr().err and (tmp_path / "a.rad").read_bytes() == written
-    main([*command, "--force"])
+    assert "a.rad: exists already" in refusal(capsys, tmp_path, *words)
+    assert (tmp_path / "a.rad").read_bytes() == written
+    run(*words, "--force")
     assert (tmp_path / "a.rad").read_bytes() == written

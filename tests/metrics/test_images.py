@@ -27,13 +27,6 @@ def test_psnr_of_covered_pixels_at_all_extremes(error, covered):
     assert math.isnan(psnr_of(math.nan, covered))
 
 
-def test_ssim_in_float32_is_that_of_float64_on_extreme_images():
-    a, b = pair(24, 24, dtype=torch.float64)
-    stripes = (torch.arange(24) % 2).double()[:, None, None].expand(24, 24, 3)
-    for x, y in ((a, b), (1e-3 * a, 1e-3 * b), (1 - 1e-3 * a, 1 - 1e-3 * b), (stripes, 1 - stripes)):
-        assert float(ssim(x.float(), y.float())) == pytest.approx(float(ssim(x, y)), abs=1e-3)  # as above
-
-
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_gradients_agree_with_float64_differences(metric):
     a, b = pair(12, 13, dtype=torch.float64)

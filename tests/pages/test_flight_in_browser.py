@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import chromium, complaints, phone_and_colours, waited
+from browser import complaints, phone_and_colours, waited
 from flying import camera, message, picture, settle, shrink, view_on
 from making import ball, cloud
 from pointsplat_ns.gaussians import Gaussians
@@ -30,12 +30,6 @@ from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 pytestmark = pytest.mark.xdist_group("flight")  # one process starts Chromium for all tests of this file
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture()

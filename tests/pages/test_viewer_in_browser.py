@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pointsplat_ns as ps
-from browser import SECONDS, before_pages_load, chromium, complaints, phone_and_colours, waited
+from browser import SECONDS, before_pages_load, complaints, phone_and_colours, waited
 from flying import picture, shrink
 from making import REPOSITORY
 from pointsplat_ns.looking.upright import Up
@@ -28,12 +28,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored in the
 from pointsplat_ns.cli import main
 main(sys.argv[1:])
 """
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.geometry.transforms import direction_of, invert_rigid
 from pointsplat_ns.io.camera_files import read_named_views
 from pointsplat_ns.io.turning import Similarity
-from pointsplat_ns.photos.posed_scene import PosesFile, read_found
+from pointsplat_ns.photos.posed_scene import read_found
 from pointsplat_ns.placing import run_frame
-from posing import inria, nerfstudio, write_colmap_text, write_photos, written
+from posing import nerfstudio, write_colmap_text, write_photos, written
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +71,6 @@ def test_poses_of_a_run_are_moved_and_drawn_as_the_run_was_trained(trained_walls
         dense, found, _ = read_found(named, path)
         assert dense.antialiased
         torch.testing.assert_close(found.viewmats.float(), known.viewmats.float(), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("nothing", [0, 3])
-def test_a_scene_of_which_nothing_is_visible_is_left_to_others(nothing, scene, views, tmp_path):
-    path = written(inria(views), tmp_path / "cameras.json")
-    invisible = scene[:nothing].replace(opacities=scene.opacities[:nothing] * 0 - 30)
-    PosesFile.of(invisible, path).check(invisible)
 
 
 def turned_about(views: ps.Views) -> ps.Views:

@@ -214,6 +214,19 @@ def dense_config(data: Path, output_dir: Path, steps: int):
     return config
 
 
+def losses_of(trainer) -> list[float]:
+    """A list that gets the loss of every step that a trainer of nerfstudio takes from now on."""
+    losses, iteration = [], trainer.train_iteration
+
+    def recorded(step: int):
+        result = iteration(step)
+        losses.append(result[0].item())
+        return result
+
+    trainer.train_iteration = recorded
+    return losses
+
+
 @contextmanager
 def views_sampled_once() -> Iterator[None]:
     """Within, trainings do not sample a scene's poses again that they sampled before. That takes most of their time."""

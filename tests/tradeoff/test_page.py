@@ -1,14 +1,13 @@
 """The page of a tradeoff: a file that needs no other, opened from disk in headless Chromium and used."""
 
 import html
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from browser import chromium, complaints
+from browser import complaints
 from html_parts import names_nothing_outside, parts_of
 from pointsplat_ns.pages.pictures import picture_uri
 from pointsplat_ns.tradeoff.points import Tradeoff
@@ -53,12 +52,6 @@ def test_texts_of_strangers_are_shown_and_never_run(tmp_path):
     assert parts.data["points"][1]["command"] == HOSTILE, "scripts read the text as it is"
     assert HOSTILE not in text and "<script>document" not in text
     assert text.count(html.escape(HOSTILE).replace("&quot;", "&#34;").replace("&#x27;", "&#39;")) >= 8
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    with chromium() as opened:
-        yield opened
 
 
 def shown(browser) -> dict[str, str]:

@@ -15,7 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 import method_configs.methods  # noqa: F401  (as nerfstudio does: completes its imports in the order that it can)
 from broken_steps import broken
-from making import QUICK_START, REPOSITORY, box_room, dense_config, equal, views_sampled_once
+from making import QUICK_START, REPOSITORY, box_room, dense_config, equal, losses_of, views_sampled_once
 from pointsplat_ns.errors import PointSplatError, SceneError
 from pointsplat_ns.io import write_ply
 from pointsplat_ns.looking.settings import changed
@@ -46,14 +46,7 @@ def train(config, judged: bool = False) -> dict:
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    losses, iteration = [], trainer.train_iteration
-
-    def recorded(step):
-        loss, parts, metrics = iteration(step)
-        losses.append(loss.item())
-        return loss, parts, metrics
-
-    trainer.train_iteration = recorded
+    losses = losses_of(trainer)
     trainer.train()
     refiner = trainer.pipeline.model.refiner
     with mock.patch("pointsplat_ns.metrics.lpips.cached_lpips", side_effect=LpipsUnavailable("not in this test")):

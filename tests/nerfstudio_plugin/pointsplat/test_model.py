@@ -86,9 +86,7 @@ def test_lpips_is_part_of_the_loss_where_it_can_be_had(trained_walls, some_lpips
     ("changes", "message"),
     [
         ({"lpips_weight": math.nan}, "lpips-weight nan: expected a finite number, 0 or above"),
-        ({"by": "merge", "opacity_weight": 0.3}, "opacity weight 0.3: merge does not weigh opacity"),
         ({"by": "pup"}, "pup looks at a scene from poses; expected a method that needs none"),
-        ({"by": "beauty"}, "no method is called 'beauty'; expected one of merge"),
         ({"encoder": "concat", "use_position": False}, "switches of the encoder 'dual'; encoder 'concat' expects both"),
         ({"keep": 0.0}, "keep is .*expected a ratio above 0"),
         ({"more_keeps": (0.3, 1.5)}, "keep is 1.5"),

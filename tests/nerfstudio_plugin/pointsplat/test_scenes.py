@@ -70,16 +70,14 @@ def test_an_unknown_dataparser_is_refused_and_a_setting_left_out(run):
     assert log.call_args.args[0].endswith("settings that its dataparser no longer has are left out: frame_leap")
 
 
-def test_code_in_a_config_is_never_run(run, tmp_path):
-    config, trap = run / "config.yml", tmp_path / "sprung"
-    bomb = f"!!python/object/apply:os.system ['touch {trap}']"
-    config.write_text(config.read_text().replace("frame_stride: 1", f"frame_stride: {bomb}"))
-    assert bomb in config.read_text()
+def test_code_in_a_config_is_never_run(run):
+    config = run / "config.yml"
+    text = config.read_text().replace("frame_stride: 1", "frame_stride: !!python/object/apply:os.system ['true']")
+    config.write_text(text)
+    assert "os.system" in text
     with mock.patch.object(os, "system", side_effect=AssertionError("the config was run")):
-        scene = scene_of(run)
-        assert len(scene.frames("train")) == 9, "the default stands where the config holds an object"
+        assert len(scene_of(run).frames("train")) == 9, "the default stands where the config holds an object"
         manager_of(run)
-    assert not trap.exists()
 
 
 def test_poses_in_another_frame_are_refused_in_training_and_in_evaluation(run, wall_scene):
