@@ -67,7 +67,7 @@ PAGE = f"""# With the photos at hand
 - CPU seconds are of a process on one thread of a busy machine: equal work differs by up to a half. All ways need the
   dense training as well.
 - PSNR (dB) and LPIPS are means over all held-out photos.
-- `{COMPACTED}` trains for 1,200 steps.
+- `{COMPACTED}` trains for 1,600 steps.
 - "{SCORES["lightgaussian"]}" and PUP-3DGS train the Gaussians with the highest scores as `{COMPACTED}` does, for as
   many CPU seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
 """
