@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.system.threads import in_threads
+from pointsplat_ns.system.threads import in_turn
 from pointsplat_ns.views import View, Views
 
 Result = TypeVar("Result")
@@ -31,13 +31,10 @@ def each_view(
             render takes memory. At least two views are rendered at once.
     """
     at_once = max(2, max_count_at_once // max(1, len(scene)))
+
+    @torch.no_grad()
+    def work(index: int) -> Result:
+        return function(scene, views[index])
+
     for first in range(0, len(views), at_once):
-        results: dict[int, Result] = {}
-
-        @torch.no_grad()
-        def work(index: int, results: dict[int, Result] = results) -> None:
-            results[index] = function(scene, views[index])
-
-        these = range(first, min(first + at_once, len(views)))
-        in_threads(work, these, scene.device)
-        yield from (results[index] for index in these)
+        yield from in_turn(work, range(first, min(first + at_once, len(views))), scene.device)

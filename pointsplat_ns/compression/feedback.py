@@ -79,7 +79,7 @@ class Feedback(Adam):
                 found[rows] = network(self.features(scene, done, steps, rows)).to(found)
 
         with one_thread_each():
-            in_threads(fill, [*pieces(len(scene), scene.device, 1 << 12)], scene.device)
+            in_threads(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)
         return found
 
     @torch.no_grad()

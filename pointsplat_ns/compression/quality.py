@@ -27,6 +27,7 @@ from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.pruning import ply_bytes
 from pointsplat_ns.system.progress import silent
 from pointsplat_ns.system.tensors import DOUBLES, INDICES
+from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.view_source import ViewSource
 
 WORDS = (
@@ -181,6 +182,7 @@ class Judge:
         """PSNR of a scene over all views, and of the worst view, dB."""
         return self._pixels.psnr(self._placed(scene), progress)
 
+    @one_thread_each()  # views are drawn at once, and what is left are small operations
     def quality(self, scene: Gaussians) -> Quality:
         """The judgement of a scene."""
         (psnr, worst), similarity = self.psnr(scene), None

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.geometry.box_tree import BoxTree
-from pointsplat_ns.system.pieces import CHUNK
+from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import FLOATS, numbers
-from pointsplat_ns.system.threads import most_threads
+from pointsplat_ns.system.threads import in_threads, most_threads
 
-QUERIES_AT_ONCE = 1 << 17
-"""Number of points whose neighbours are searched at once, to save memory."""
+QUERIES_AT_ONCE = 1 << 14
+"""Number of points whose neighbours a thread searches at once, to save memory; on a GPU, eight times as many."""
 
 
 def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -37,6 +37,11 @@ def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         return nothing.double(), nothing.long()
     places = points.detach().double().cpu()
     return _CpuTree(places).nearest(places, min(k, n))
+
+
+def import_tree() -> None:
+    """Import scipy before it is needed: it takes long."""
+    import scipy.spatial  # noqa: F401
 
 
 class _CpuTree:
@@ -81,19 +86,18 @@ def other_neighbours(points: Tensor, k: int) -> Tensor:
         return near
     found = min(k + 1, len(points))
     tree = _tree_of(points, found)
-    for these in own.split(QUERIES_AT_ONCE):
+    same = torch.empty_like(own, dtype=torch.bool)
+
+    def search(these: slice) -> None:
         _, indices = tree.nearest(points[these], found)
         # The point itself is the first, or, among coincident ones, anywhere or missing: the first takes its place.
-        indices = indices.where(indices != these[:, None], indices[:, :1])
+        indices = indices.where(indices != own[these, None], indices[:, :1])
         near[these, : found - 1] = indices[:, 1:].to(torch.int32)
-    if found <= k:
-        return near
-    same = [
-        (points[last.long()] == points[these]).all(1)
-        for last, these in zip(near[:, k - 1].split(CHUNK), own.split(CHUNK), strict=True)
-    ]
-    crowd = torch.cat(same).nonzero()[:, 0]
-    if len(crowd):
+        same[these] = (points[near[these, k - 1].long()] == points[these]).all(1)
+
+    in_threads(search, pieces(len(points), points.device, QUERIES_AT_ONCE), points.device)
+    crowd = same.nonzero()[:, 0]
+    if found > k and len(crowd):
         walk = tree.order
         before, after = torch.empty_like(walk), torch.empty_like(walk)
         before[walk], after[walk] = walk.roll(1), walk.roll(-1)

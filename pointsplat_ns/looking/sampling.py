@@ -18,6 +18,7 @@ wrong. ``docs/concepts/sampled_views.md`` says more.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 from functools import cached_property
@@ -25,7 +26,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pointsplat_ns.comparing.each_view import each_view
 from pointsplat_ns.comparing.sizes import RESOLUTION
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -37,6 +37,7 @@ from pointsplat_ns.looking.traces import PhotoTraces, log_widths, means_around
 from pointsplat_ns.looking.upright import Surface, Up, known_up, upright
 from pointsplat_ns.rasterizer import pixels_of
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.system.threads import in_turn
 from pointsplat_ns.views import Views
 
 
@@ -167,6 +168,11 @@ class Sampler:
         """Height below which no camera stands."""
         return float((self.few.means[self._targets].double() @ self.up.direction).quantile(0.05))
 
+    def prepare(self) -> None:
+        """Find what all views have in common, if anything of the scene is visible."""
+        with contextlib.suppress(DataError):
+            _ = self.up, self._log_widths
+
     @torch.no_grad()
     def views(self, count: int, seed: int = 0, likeliest: bool = False) -> Views:
         """``count`` views on the CPU. ``count``, ``seed`` and errors are those of :func:`sample_views`. Views complete
@@ -187,17 +193,20 @@ class Sampler:
         eyes = invert_rigid(viewmats)[:, :3, 3]
         small = replace(views.resized(LOOKING.candidate_side), rasterize_mode="antialiased")
         widths = self._log_widths.exp().float()
-        likelihoods, shown = [], []
-        for eye, pixels in zip(eyes, each_view(self.few, small, pixels_of), strict=True):
+
+        def look(index: int) -> tuple[float, Tensor]:
+            pixels = pixels_of(self.few, small[index])
             covered = float(pixels.double().sum())
-            distances = (self.few.means - eye.float()).norm(dim=1).clamp_min(1e-3)
+            distances = (self.few.means - eyes[index].float()).norm(dim=1).clamp_min(1e-3)
             blur = 1.0  # radian, of a view that shows nothing
             if covered > 0:
                 blur = max(float((pixels * widths / distances).double().sum()) / covered, 1e-9)
-            shown.append(pixels > 0.02)  # sum of blend weights
-            share = (float(shown[-1].sum()) + 1) / len(pixels)
+            shown = pixels > 0.02  # sum of blend weights
+            share = (float(shown.sum()) + 1) / len(pixels)
             empty = max(0.0, 1 - covered / (small.width * small.height))
-            likelihoods.append(math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur))
+            return math.log(share) - math.log(empty + 0.01) - 2 * math.log(blur), shown
+
+        likelihoods, shown = zip(*in_turn(look, range(len(small)), self.few.device), strict=True)
         traces = self._traces
         evidence = traces.evidence(eyes).double() if traces.has_sh else torch.zeros(len(eyes), **DOUBLES)
         pitch = torch.rad2deg(torch.asin((viewmats[:, 2, :3] @ self.up.direction).clamp(-1, 1)))

@@ -21,6 +21,7 @@ from pointsplat_ns.merging.state import Participants, State
 from pointsplat_ns.rasterizer.constants import ALPHA_MAX
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import add_rows, numbers
+from pointsplat_ns.system.threads import in_threads, in_turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +103,15 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
     means = []
     for values in (scene.features_dc, scene.features_rest):
         mean = torch.zeros(len(single), *values.shape[1:], dtype=wide, device=values.device)
-        for rows in pieces(len(group), group.device):
-            own = values[participants.members[rows]].to(wide)
-            add_rows(mean, group[rows], own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1)))
-            of_single = single[group[rows]]
-            mean[group[rows][of_single]] = own[of_single]
+
+        def part(rows: slice, values: Tensor = values) -> tuple[Tensor, ...]:
+            own, of_single = values[participants.members[rows]].to(wide), single[group[rows]]
+            shared = own * shares[rows].to(wide).view(-1, *[1] * (own.dim() - 1))
+            return group[rows], shared, group[rows][of_single], own[of_single]
+
+        for groups, shared, singles, own in in_turn(part, pieces(len(group), group.device), group.device):
+            add_rows(mean, groups, shared)
+            mean[singles] = own
         means.append(mean.to(scene.dtype))
     return means[0], means[1]
 
@@ -114,13 +119,16 @@ def _mean_sh(participants: Participants, group: Tensor, shares: Tensor, single: 
 def _axes(cov: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Log-scales (n, 3) float64, and quaternions (n, 4) of some dtype, of covariances (n, 6)."""
     scales, quats = cov.new_empty(len(cov), 3), cov.new_empty(len(cov), 4, dtype=dtype)
-    for rows in pieces(len(cov), cov.device):
+
+    def fill(rows: slice) -> None:
         variances, axes = eigen(unpack(cov[rows]))
         axes[:, :, 0] *= torch.linalg.cross(axes[:, :, 1], axes[:, :, 2]).mul_(axes[:, :, 0]).sum(1).sign()[:, None]
         # as covariances(): rounding leaves nothing of what is thinner
         variances = torch.maximum(variances, 1e-10 * variances[:, 2:]).clamp_min(MIN_DIVISOR)
         scales[rows] = 0.5 * variances.log()
         quats[rows] = quaternions_of(axes).to(dtype)
+
+    in_threads(fill, pieces(len(cov), cov.device), cov.device)
     return scales, quats
 
 

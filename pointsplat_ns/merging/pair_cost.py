@@ -110,7 +110,7 @@ def pair_costs(
         total = sum(costs_in_plane(state, own[rows], near[rows].long(), plane, settings, dtype) for plane in planes)
         costs[rows] = total * state.weights[rows, None]
 
-    in_threads(fill, list(pieces(len(state), device, 1 << 14)), device)  # 50 MB at once
+    in_threads(fill, pieces(len(state), device, 1 << 14), device)  # 50 MB at once
     return costs
 
 

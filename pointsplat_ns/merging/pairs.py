@@ -36,6 +36,7 @@ from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import numbers
+from pointsplat_ns.system.threads import in_threads, in_turn
 
 NEVER = torch.iinfo(torch.int64).max
 """Key of a pair that cannot be."""
@@ -56,48 +57,53 @@ def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_p
     Returns:
         First and second members, (E,) int64 each, and costs, (E,) float32; at least one pair if there is any neighbour.
     """
-    n, keys = len(near), _keys(near, costs)
-    rows, others, found = numbers(n, near.device), near.T.long().contiguous(), []
-    for _ in range(passes):
-        least, slot = keys.min(0)
-        best = rows.new_full((n,), NEVER)
-        best[rows] = least
-        best.scatter_reduce_(0, others.flatten(), keys.flatten(), "amin")
-        partner = others.gather(0, slot[None])[0]
-        mutual = (least == best[rows]) & (least == best[partner]) & (least < NEVER)
-        i, j = rows[mutual], partner[mutual]
-        found.append((i, j, least[mutual]))
-        taken = torch.zeros_like(best, dtype=torch.bool)
-        taken[i] = taken[j] = True
+    n, device = len(near), near.device
+    taken = torch.zeros(n, dtype=torch.bool, device=device)
+
+    def free(block: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """The rows with pairs of which both members are free, and for each its least key and the partner of that."""
+        rows, others, keys, *_ = block
         keys.masked_fill_(taken[rows] | taken.index_select(0, others.flatten()).view(others.shape), NEVER)
-        left = (keys.amin(0) < NEVER).nonzero()[:, 0]
-        if len(i) == 0 or len(left) == 0:
-            break
-        rows, others, keys = rows[left], others.index_select(1, left), keys.index_select(1, left)
+        least, slot = keys.min(0)  # amin takes several times as long
+        left, partner = (least < NEVER).nonzero()[:, 0], others.gather(0, slot[None])[0]
+        return rows[left], others.index_select(1, left), keys.index_select(1, left), least[left], partner[left]
+
+    blocks = [*in_turn(lambda here: _pairs(near, costs, here), pieces(n, device, 1 << 15), device)]
+    found: list[tuple[Tensor, ...]] = [(numbers(0, device),) * 3]
+    for _ in range(passes):
+        blocks = [block for block in in_turn(free, blocks, device) if len(block[0])]
+        best = torch.full_like(taken, NEVER, dtype=torch.int64)
+        for rows, others, keys, least, _ in blocks:
+            best[rows] = torch.minimum(best[rows], least)
+            best.scatter_reduce_(0, others.flatten(), keys.flatten(), "amin")
+        for rows, _, _, least, partner in blocks:
+            mutual = (least == best[rows]) & (least == best[partner])
+            i, j = rows[mutual], partner[mutual]
+            found.append((i, j, least[mutual]))
+            taken[i] = taken[j] = True
     first, second, key = (torch.cat(parts) for parts in zip(*found, strict=True))
     prices, order = (key >> 32).int().view(torch.float32).sort(stable=True)
     return first[order], second[order], prices
 
 
-def _keys(near: Tensor, costs: Tensor) -> Tensor:
-    """Numbers (k, n) int64 of pairs, each pair in the row of its smaller index if both are neighbours of each other.
-    They are ordered as the costs, whose bits are the upper half: the bits of a float32 that is not negative are ordered
-    as the float is. The lower half makes them all different."""
-    n, k = near.shape
-    everyone, slots = numbers(n, near.device), numbers(k, near.device)
-    keys = everyone.new_empty(k, n)
-    for here in pieces(n, near.device, 1 << 14):  # these fit into a cache
-        own, others, me = costs[here], near[here].long(), everyone[here, None]
-        back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
-        theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
-        slot = back.to(torch.uint8).argmax(2, keepdim=True)
-        mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
-        once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
-        # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
-        hashed = ((me * k + slots) * 2654435761) & 0xFFFFFFFF
-        key = (once.view(torch.int32).long() << 32) | hashed
-        keys[:, here] = key.where(once < math.inf, NEVER).T
-    return keys
+def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
+    """Some Gaussians (m,), their neighbours (k, m), and the keys (k, m) of these pairs, all int64.
+
+    A pair is in the row of its smaller index if both are neighbours of each other. Keys are ordered as the costs, whose
+    bits are the upper half: the bits of a float32 that is not negative are ordered as the float is. The lower half
+    makes them all different."""
+    k = near.shape[1]
+    rows, slots = numbers(here.stop - here.start, near.device) + here.start, numbers(k, near.device)
+    own, others, me = costs[here], near[here].long(), rows[:, None]
+    back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
+    theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
+    slot = back.to(torch.uint8).argmax(2, keepdim=True)
+    mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
+    once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
+    # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
+    hashed = ((me * k + slots) * 2654435761) & 0xFFFFFFFF
+    key = (once.view(torch.int32).long() << 32) | hashed
+    return rows, others.T.contiguous(), key.where(once < math.inf, NEVER).T.contiguous()
 
 
 class Round(NamedTuple):
@@ -123,9 +129,10 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
     place = stays.cumsum(0) - 1
     place[second] = place[first]
     rows = stays.nonzero()[:, 0]
-    after = State(**{name: values.index_select(0, rows) for name, values in vars(state).items()})
+    after = State(*in_turn(lambda values: values.index_select(0, rows), [*vars(state).values()], rows.device))
     shares = torch.ones_like(state.weights)
-    for part in pieces(len(first), first.device, 1 << 13):  # these fit into a cache
+
+    def replace(part: slice) -> None:
         i, j = first[part], second[part]
         k = place[i]
         (ui, ci, ai), (uj, cj, aj) = (
@@ -150,6 +157,8 @@ def replace_pairs(state: State, first: Tensor, second: Tensor, settings: MergeSe
         after.weights[k] = share * state.weights[i] + other * state.weights[j]
         after.counts[k] = state.counts[i] + state.counts[j]
         shares[i], shares[j] = share, 1 - share
+
+    in_threads(replace, pieces(len(first), first.device, 1 << 13), first.device)  # these fit into a cache
     return after, Round(place.int(), shares)
 
 

@@ -13,7 +13,7 @@ mass of a member, by which the moments of a group are weighted, is opacity times
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -38,7 +38,7 @@ from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES, add_rows, numbers
-from pointsplat_ns.system.threads import most_threads
+from pointsplat_ns.system.threads import in_threads, in_turn, most_threads
 
 
 class Members:
@@ -52,14 +52,12 @@ class Members:
 
     def __init__(self, scene: Gaussians, rows: Tensor):
         self._scene, self._rows = scene, rows
-        self.masses = torch.empty(len(rows), dtype=torch.float64, device=rows.device)
+        self.masses = in_pieces(
+            lambda some: torch.sigmoid(scene.opacities[some, 0].double()) * rms_area(covariances_of(scene, some)), rows
+        )
         """Opacity times root mean square area, (n,)."""
-        for these in self.pieces():
-            some = rows[these]
-            alphas = torch.sigmoid(scene.opacities[some, 0].double())
-            self.masses[these] = alphas * rms_area(covariances_of(scene, some))
 
-    def pieces(self) -> Iterator[slice]:
+    def pieces(self) -> list[slice]:
         """All members, in pieces."""
         return pieces(len(self._rows), self._rows.device)
 
@@ -151,15 +149,14 @@ def group_moments(members: Members, group: Tensor, count: int) -> Moments:
 
     mass, sizes = add_rows(zeros(), group, members.masses), torch.bincount(group, minlength=count)
     found = Moments(mass, sizes, zeros(3), zeros(6), zeros(3))
-    for these in members.pieces():
-        own = group[these]
-        share = found.shares(members.masses[these], own)[:, None]
-        add_rows(found.means, own, share * members.means(these))
-        add_rows(found.colours, own, share * members.colours(these))
-    for these in members.pieces():
-        own = group[these]
-        share = found.shares(members.masses[these], own)[:, None]
-        add_rows(found.cov, own, share * (members.cov(these) + outer(members.means(these) - found.means[own])))
+    spread = found.cov, lambda these: members.cov(these) + outer(members.means(these) - found.means[group[these]])
+    for total, values_of in ((found.means, members.means), (found.colours, members.colours), spread):
+
+        def shared(these: slice, values_of: Callable[[slice], Tensor] = values_of) -> tuple[Tensor, Tensor]:
+            return group[these], found.shares(members.masses[these], group[these])[:, None] * values_of(these)
+
+        for own, values in in_turn(shared, members.pieces(), group.device):
+            add_rows(total, own, values)
     return found
 
 
@@ -182,17 +179,21 @@ def best_groups(
     """
     inverse, log_determinants = torch.empty_like(groups.cov), torch.empty_like(groups.mass)
     occurrences = groups.cov.new_tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # of the numbers of a symmetric matrix
-    for some in pieces(len(groups.mass), groups.mass.device):
+
+    def invert(some: slice) -> None:
         cov = groups.cov[some]
         variance = diagonals(cov).mean(1).clamp_min(MIN_DIVISOR)
         shapes = unpack(cov / variance[:, None]) + 1e-6 * torch.eye(3, **DOUBLES).to(cov.device)  # invertible if flat
         inverses, logs = inverses_and_log_determinants(shapes)
         inverse[some] = pack(inverses) * (occurrences / variance[:, None])
         log_determinants[some] = logs + 3 * variance.log()
+
+    in_threads(invert, pieces(len(groups.mass), group.device), group.device)
     colour_weight = 1 / (2 * settings.regrouping_contrast**2)
 
     result, nearest = torch.empty_like(group), NearestOf(groups.means, 6)
-    for these in members.pieces():
+
+    def choose(these: slice) -> None:
         means, cov, colours, own = members.means(these), members.cov(these), members.colours(these), group[these]
         near = nearest(means)
         if KERNELS.usable_for(compiled, colours):
@@ -204,7 +205,7 @@ def best_groups(
             )  # fmt: skip
             on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
             result[these] = best
-            continue
+            return
         candidates = torch.cat([own[:, None], near], dim=1)  # (m, 7)
         apart = means[:, None] - groups.means[candidates]
         second = cov[:, None] + outer(apart.view(-1, 3)).view(*candidates.shape, 6)
@@ -212,5 +213,7 @@ def best_groups(
         fit += (colours[:, None] - groups.colours[candidates]).square().sum(2) * colour_weight
         best = fit.nan_to_num_(nan=torch.inf).argmin(1, keepdim=True)  # the first of equals
         result[these] = candidates.gather(1, best)[:, 0]
+
+    in_threads(choose, members.pieces(), group.device)
     heaviest = torch.zeros_like(groups.mass).scatter_reduce_(0, group, members.masses, "amax")
     return torch.where(members.masses >= heaviest[group], group, result)

@@ -12,7 +12,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from torch import Tensor
 from pointsplat_ns.comparing.sizes import RendersOfSizes, middle_side
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.geometry.neighbours import other_neighbours
+from pointsplat_ns.geometry.neighbours import import_tree, other_neighbours
 from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
@@ -32,7 +32,7 @@ from pointsplat_ns.merging.state import Participants, State, drawable, initial_s
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.memory import give_back_freed_memory
 from pointsplat_ns.system.tensors import numbers
-from pointsplat_ns.system.threads import one_thread_each
+from pointsplat_ns.system.threads import in_turn, one_thread_each
 from pointsplat_ns.views import Views
 
 logger = logging.getLogger("pointsplat_ns")
@@ -245,7 +245,12 @@ def first_step(
     """The step before the first round, of at least ``k`` Gaussians; ``views`` as for :func:`merge`. Nothing is rendered
     if they are no more than the ``last`` count, so that no round follows."""
     with one_thread_each():
-        participants = Participants.of(scene, drawable(scene, k))
+        members = drawable(scene, k)
+        begin: list[Callable[[], Any]] = [lambda: Participants.of(scene, members)]
+        if not isinstance(views, Views) and len(members) >= max(last + 1, settings.min_count_rendered):
+            views = views or Sampler(scene)
+            begin.append(views.prepare)
+        participants, *_ = in_turn(lambda step: step(), [*begin, import_tree], scene.device)
         found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))

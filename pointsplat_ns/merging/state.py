@@ -17,6 +17,7 @@ from pointsplat_ns.merging.covariance import covariances_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES
+from pointsplat_ns.system.threads import in_turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +125,17 @@ def principal_axes(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
     does. Eight axes hold nearly all of the variance.
     """
     width = 3 + 3 * scene.features_rest.shape[1]
-    first, *_ = parts = list(pieces(len(members), members.device))
+    first, *_ = parts = pieces(len(members), members.device)
     shift = _coefficients(scene, members[first]).mean(0)  # near the mean, so that float32 holds the squares
     total, products = (torch.zeros(*shape, **DOUBLES).to(members.device) for shape in ((width,), (width, width)))
-    for these in parts:
+
+    def sums(these: slice) -> tuple[Tensor, Tensor]:
         values = _coefficients(scene, members[these]) - shift
-        total += values.sum(0)
-        products += values.T @ values
+        return values.sum(0), values.T @ values
+
+    for values, squares in in_turn(sums, parts, members.device):
+        total += values
+        products += squares
     mean = total / len(members)
     covariance = products - len(members) * mean[:, None] * mean
     axes = torch.linalg.eigh(covariance.cpu()).eigenvectors[:, -8:]

@@ -21,6 +21,7 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.system.cores import cores, free_cores
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 THREADS_VARIABLE = "OMP_NUM_THREADS"
 """Environment variable with the number of torch's threads. Where it is set, no other number is chosen."""
@@ -70,22 +71,32 @@ def one_thread_each() -> Iterator[None]:
         chosen.most, chosen.fixed = outer
 
 
-def in_threads(function: Callable[[Item], object], items: Sequence[Item], device: torch.device) -> None:
-    """Call a function with each item: on a CPU on :func:`most_threads` threads, torch using one inside each; for a GPU
-    in this thread, as a GPU runs one operation of a process after the other, and not all of torch may be called there
-    from several threads.
+def in_turn(function: Callable[[Item], Result], items: Sequence[Item], device: torch.device) -> Iterator[Result]:
+    """The results of a function of each item, in their order: computed on a CPU on :func:`most_threads` threads, torch
+    using one inside each; for a GPU in this thread, as a GPU runs one operation of a process after the other, and not
+    all of torch may be called there from several threads.
 
     One operation on a small piece that stays in the cache is faster on one thread than shared between several, which
-    wait for one another. Calls must not depend on each other.
+    wait for one another. Calls must not depend on each other. torch takes gradients in them if it does here.
     """
     count = min(most_threads(), len(items)) if device.type == "cpu" else 1
     if count <= 1:
-        for item in items:
-            function(item)
+        yield from map(function, items)
         return
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def call(item: Item) -> Result:
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+            return function(item)
+
     with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for _ in pool.map(function, items):
-            pass
+        yield from pool.map(call, items)
+
+
+def in_threads(function: Callable[[Item], object], items: Sequence[Item], device: torch.device) -> None:
+    """Call a function with each item as :func:`in_turn` does."""
+    for _ in in_turn(function, items, device):
+        pass
 
 
 @contextmanager
