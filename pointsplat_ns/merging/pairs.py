@@ -60,22 +60,23 @@ def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_p
     n, device = len(near), near.device
     taken = torch.zeros(n, dtype=torch.bool, device=device)
 
-    def free(block: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """The rows with pairs of which both members are free, and for each its least key and the partner of that."""
-        rows, others, keys, *_ = block
+    def free(number: int) -> None:
+        """Leave in a block the rows of free Gaussians with free neighbours, the least key of each, and its partner."""
+        rows, others, keys, *_ = blocks[number]
         keys.masked_fill_(taken[rows] | taken.index_select(0, others.flatten()).view(others.shape), NEVER)
         least, slot = keys.min(0)  # amin takes several times as long
         left, partner = (least < NEVER).nonzero()[:, 0], others.gather(0, slot[None])[0]
-        return rows[left], others.index_select(1, left), keys.index_select(1, left), least[left], partner[left]
+        own = rows[left], others.index_select(1, left), keys.index_select(1, left)
+        blocks[number] = *own, least[left], partner[left].long()
 
-    blocks = [*in_turn(lambda here: _pairs(near, costs, here), pieces(n, device, 1 << 15), device)]
+    blocks = [*in_turn(lambda here: _pairs(near, costs, here), pieces(n, device, 1 << 14), device)]
     found: list[tuple[Tensor, ...]] = [(numbers(0, device),) * 3]
     for _ in range(passes):
-        blocks = [block for block in in_turn(free, blocks, device) if len(block[0])]
+        in_threads(free, range(len(blocks)), device)
         best = torch.full_like(taken, NEVER, dtype=torch.int64)
         for rows, others, keys, least, _ in blocks:
             best[rows] = torch.minimum(best[rows], least)
-            best.scatter_reduce_(0, others.flatten(), keys.flatten(), "amin")
+            best.scatter_reduce_(0, others.flatten().long(), keys.flatten(), "amin")
         for rows, _, _, least, partner in blocks:
             mutual = (least == best[rows]) & (least == best[partner])
             i, j = rows[mutual], partner[mutual]
@@ -87,21 +88,21 @@ def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_p
 
 
 def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
-    """Some Gaussians (m,), their neighbours (k, m), and the keys (k, m) of these pairs, all int64.
+    """Some Gaussians (m,) int64, their neighbours (k, m) int32, and the keys (k, m) int64 of these pairs.
 
     A pair is in the row of its smaller index if both are neighbours of each other. Keys are ordered as the costs, whose
     bits are the upper half: the bits of a float32 that is not negative are ordered as the float is. The lower half
     makes them all different."""
     k = near.shape[1]
     rows, slots = numbers(here.stop - here.start, near.device) + here.start, numbers(k, near.device)
-    own, others, me = costs[here], near[here].long(), rows[:, None]
+    own, others, me = costs[here], near[here], rows[:, None].int()
     back = near.index_select(0, others.flatten()).view(-1, k, k) == me[:, :, None]
     theirs = costs.index_select(0, others.flatten()).view(-1, k, k)
     slot = back.to(torch.uint8).argmax(2, keepdim=True)
     mean = ((own + theirs.gather(2, slot)[:, :, 0]) / 2).where(others > me, math.inf)
     once = mean.where(back.any(2), own).where(others != me, math.inf).contiguous()
     # Multiplying by an odd number modulo 2^32 permutes the numbers of pairs (Knuth's multiplicative hashing).
-    hashed = ((me * k + slots) * 2654435761) & 0xFFFFFFFF
+    hashed = ((rows[:, None] * k + slots) * 2654435761) & 0xFFFFFFFF
     key = (once.view(torch.int32).long() << 32) | hashed
     return rows, others.T.contiguous(), key.where(once < math.inf, NEVER).T.contiguous()
 

@@ -251,6 +251,7 @@ def first_step(
             views = views or Sampler(scene)
             begin.append(views.prepare)
         participants, *_ = in_turn(lambda step: step(), [*begin, import_tree], scene.device)
+        give_back_freed_memory()  # of threads that have ended
         found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
