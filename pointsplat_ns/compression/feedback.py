@@ -75,8 +75,7 @@ class Feedback(Adam):
         found = scene.means.new_empty(len(scene), len(PARAMETERS))
 
         def fill(rows: slice) -> None:
-            with torch.no_grad():  # of this thread
-                found[rows] = network(self.features(scene, done, steps, rows)).to(found)
+            found[rows] = network(self.features(scene, done, steps, rows)).to(found)
 
         with one_thread_each():
             in_threads(fill, pieces(len(scene), scene.device, 1 << 12), scene.device)

@@ -247,10 +247,13 @@ def first_step(
     with one_thread_each():
         members = drawable(scene, k)
         begin: list[Callable[[], Any]] = [lambda: Participants.of(scene, members)]
-        if not isinstance(views, Views) and len(members) >= max(last + 1, settings.min_count_rendered):
-            views = views or Sampler(scene)
-            begin.append(views.prepare)
-        participants, *_ = in_turn(lambda step: step(), [*begin, import_tree], scene.device)
+        if len(members) > last:
+            if not isinstance(views, Views) and len(members) >= settings.min_count_rendered:
+                views = views or Sampler(scene)
+                begin.append(views.prepare)
+            if scene.device.type == "cpu":  # elsewhere, another tree is used
+                begin.append(import_tree)
+        participants, *_ = in_turn(lambda step: step(), begin, scene.device)
         give_back_freed_memory()  # of threads that have ended
         found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
