@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pointsplat_ns.compression.optimiser import Adam, AdamSettings
+from pointsplat_ns.compression.optimiser import Adam, AdamSettings, Choose
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.threads import in_threads, one_thread_each
@@ -63,6 +63,11 @@ class Feedback(Adam):
         self._gradients = gradients
         visible = (gradients["features_dc"] != 0).any(1, keepdim=True)
         self._visibility.lerp_(visible.to(self._visibility), 1 - self._settings.betas[1])
+
+    def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
+        """As :meth:`Adam.stepped`; the factors may be chosen of these gradients."""
+        self.observe(gradients)
+        return self.moved(scene, *choose(scene))
 
     def state(self) -> dict[str, Tensor]:
         """As :meth:`Adam.state`."""

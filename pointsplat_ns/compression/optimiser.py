@@ -20,6 +20,7 @@ from pointsplat_ns.metrics import PIXEL_LOSSES, SSIM_WINDOW, PixelLoss
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
 from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import one_thread, suitable_threads
 from pointsplat_ns.views import View
@@ -33,6 +34,10 @@ RATES = {
     "features_rest": 2.5e-3 / 20,
 }
 """Learning rates by parameter, as in 3DGS."""
+
+
+Choose = Callable[[Gaussians], tuple[float, Tensor | None]]
+"""From the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +80,7 @@ class Adam:
         beta, square_beta = self._settings.betas
         for name in RATES:
             gradient = gradients[name]
-            if self._settings.damping:
-                self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(gradient)
+            self._damp(name, gradient)
             self._first[name].lerp_(gradient, 1 - beta)
             self._second[name].mul_(square_beta).addcmul_(gradient, gradient, value=1 - square_beta)
             root = (self._second[name] / self._weight_sum(1)).sqrt_()
@@ -102,6 +106,30 @@ class Adam:
         moves = self.moves(share, factors)
         return scene.replace(**{name: value + moves[name] for name, value in scene.items()})
 
+    @torch.no_grad()
+    def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
+        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are chosen of the scene, by a
+        compiled kernel in one pass where it was built."""
+        share, factors = choose(scene)
+        if not KERNELS.usable_for(None, *scene.tensors()):
+            self.observe(gradients)
+            return self.moved(scene, share, factors)
+        self._steps += 1
+        factors = None if factors is None else factors.to(scene.means).contiguous()
+        moved = {name: torch.empty_like(value) for name, value in scene.items()}
+        beta, square_beta = self._settings.betas
+        for kind, (name, values) in enumerate(scene.items()):
+            self._damp(name, gradients[name])
+            task = KERNELS.structs["AdamStep"](
+                values=values.contiguous(), gradient=gradients[name].contiguous(), first=self._first[name],
+                second=self._second[name], moved=moved[name], factors=factors, count=len(values),
+                columns=values[:1].numel(), kind=kind, kinds=len(RATES), rate=share * self.rates[name],
+                epsilon=self._epsilon(name), fresh=1 - beta, kept_square=square_beta, fresh_square=1 - square_beta,
+                weight_sum=self._weight_sum(0), square_weight_sum=self._weight_sum(1),
+            )  # fmt: skip
+            on_threads(len(values) >= SEVERAL, KERNELS.library.pointsplat_adam, task)
+        return scene.replace(**moved)
+
     def state(self) -> dict[str, Tensor]:
         """What the next steps depend on, by name: the averages themselves, and the damping."""
         averages = {"first": self._first, "second": self._second}
@@ -122,6 +150,10 @@ class Adam:
         """The sum of the weights in an average, for bias correction; ``which`` indexes ``betas``."""
         return 1 - self._settings.betas[which] ** self._steps
 
+    def _damp(self, name: str, gradient: Tensor) -> None:
+        if self._settings.damping:
+            self._damping[name] = self._damping[name] or self._settings.damping * nonzero_rms(gradient)
+
     def _epsilon(self, name: str) -> float:
         return max(self._damping[name], 1e-15)
 
@@ -130,7 +162,7 @@ def optimised(
     scene: Gaussians,
     adam: Adam,
     examples: Iterator[Example],
-    choose: Callable[[Gaussians], tuple[float, Tensor | None]] = lambda scene: (1.0, None),
+    choose: Choose = lambda scene: (1.0, None),
     pixel_loss: PixelLoss = "rmse",
 ) -> Iterator[Gaussians]:
     """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
@@ -140,15 +172,13 @@ def optimised(
         scene: K Gaussians; not changed.
         adam: its averages; made from the same scene.
         examples: views and their target images, without end.
-        choose: from the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`. It is
-            called after the gradients of the step are computed.
+        choose: the length of a step; called after its gradients are computed.
         pixel_loss: "l1" for the loss of 3DGS.
     """
     scene = scene.detach()
     while True:
         with suitable_threads(scene.device):
-            adam.observe(gradients_of(scene, *next(examples), pixel_loss=pixel_loss))
-            scene = adam.moved(scene, *choose(scene))
+            scene = adam.stepped(scene, gradients_of(scene, *next(examples), pixel_loss=pixel_loss), choose)
         yield scene
 
 
@@ -173,7 +203,8 @@ def size_factors(scene: Gaussians, reach: float) -> Tensor:
         (K, 6).
     """
     factors = scene.means.new_ones(len(scene), len(RATES))
-    middle = scene.scales.median(dim=1).values.clamp(max=math.log(reach))
+    a, b, c = scene.scales.unbind(1)
+    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c)).clamp(max=math.log(reach))
     factors[:, list(RATES).index("means")] = (middle - math.log(reach)).exp().nan_to_num(0.0)
     return factors
 

@@ -28,6 +28,14 @@ def untiled(values: Tensor, columns: int) -> Tensor:
     return values.view(rows, columns, -1, TILE, TILE).permute(0, 3, 1, 4, 2).reshape(rows * TILE, columns * TILE, -1)
 
 
+def tiled(values: Tensor, rows: int, columns: int) -> Tensor:
+    """Tiles (rows * columns, D, 64) of pixels (H, W, D), zeros beyond them."""
+    height, width, channels = values.shape
+    whole = values.new_zeros(rows * TILE, columns * TILE, channels)
+    whole[:height, :width] = values
+    return whole.view(rows, TILE, columns, TILE, channels).permute(0, 2, 4, 1, 3).reshape(-1, channels, PIXELS)
+
+
 class Blend(torch.autograd.Function):
     """Blend projected Gaussians into some rows of tiles; see :func:`blend`."""
 

@@ -1,22 +1,27 @@
-"""Pictures without gradients by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass
-over the Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`).
+"""Pictures by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass over the Gaussians,
+then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`). The gradients by all parameters of
+a scene take another pass.
 
-:func:`~pointsplat_ns.rasterization` gives the same pictures to rounding.
+:func:`~pointsplat_ns.rasterization` gives the same pictures and gradients to rounding.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.rasterizer import projection
-from pointsplat_ns.rasterizer.blending import untiled
+from pointsplat_ns.rasterizer.blending import tiled, untiled
 from pointsplat_ns.rasterizer.compiled import blending, tiles
 from pointsplat_ns.rasterizer.constants import MEMORY_BUDGET
-from pointsplat_ns.rasterizer.ellipses import Grid
+from pointsplat_ns.rasterizer.ellipses import Grid, TileList
 from pointsplat_ns.rasterizer.projection import Camera, count_meaningless
 from pointsplat_ns.rasterizer.quadratics import PIXELS
+from pointsplat_ns.rasterizer.spherical_harmonics import zeros_like
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread
@@ -25,12 +30,21 @@ MOST_PAIRS = MEMORY_BUDGET // 16
 """Largest number of pairs of Gaussian and tile in one pass, of 12 bytes each; pictures of more are drawn by regions."""
 
 
-def _placed(
-    scene: Gaussians, camera: Camera, colored: bool, alpha_min: float
-) -> tuple[Struct, Tensor, list[Tensor]] | None:
-    """The task of drawing a picture, with or without colours, the Gaussians of each tile front to back (P,), int64, and
-    the means, quaternions, standard deviations and opacities of the Gaussians as the kernels read them; None if the
-    pairs are more than :data:`MOST_PAIRS`."""
+class _Placed(NamedTuple):
+    """What one camera sees of a scene."""
+
+    grid: Grid
+    table: Tensor  # [N, 6 + channels], as of :func:`blending.inputs_of`, rows of Gaussians that are drawn
+    tiles: TileList
+    ids: Tensor  # [M] int64, the Gaussians that are drawn, ascending
+    task: Struct  # of the kernel
+    skipped: int  # number of Gaussians with invalid values
+
+
+@torch.no_grad()
+def _placed(scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, taped: bool = False) -> _Placed | None:
+    """What a camera sees, with or without colours, with all that gradients need if it is ``taped``; None if the pairs
+    are more than :data:`MOST_PAIRS`, or than gradients of 192 bytes each have memory for."""
     library, count = KERNELS.library, len(scene)
     with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
         tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
@@ -38,47 +52,82 @@ def _placed(
     channels, grid = (3 if colored else 0), Grid(camera.lens.width, camera.lens.height, alpha_min)
     ranges = -(-count // library.pointsplat_range())
     table, depths = torch.empty(count, 6 + channels, **FLOATS), torch.empty(count, **DOUBLES)
-    ids, counts = torch.empty(count, **INDICES), torch.empty(ranges, **INDICES)
+    ids, counts, spoilt = (torch.empty(size, **INDICES) for size in (count, ranges, ranges))
     task = KERNELS.structs["Placing"](
         camera=projection.camera_struct(*camera), scene=projection.scene_struct(*tensors),
         first=coefficients[0], rest=coefficients[1], rest_row=3 * coefficients[1].shape[1],
         degree=scene.sh_degree if colored else -1,
         most_color=torch.finfo(torch.float32).max ** 0.8, table=table, depths=depths, counts=counts,
-        ids=ids,
+        spoilt=spoilt, ids=ids,
     )  # fmt: skip
     on_threads(count >= SEVERAL, library.pointsplat_place, task)
     rows = projection.kept_rows(counts)
-    order = ids[rows][tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
-    found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, most_pairs=MOST_PAIRS)
+    ids = ids[rows]
+    order = ids[tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
+    of_each = torch.zeros_like(order) if taped else None
+    most = MOST_PAIRS // 12 if taped else MOST_PAIRS
+    found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, of_each, most)
     if found is None:
         return None
-    pairs, offsets, _ = found
-    return blending.task_of(table, grid, pairs, offsets, offsets), pairs, tensors
+    pairs, offsets, places = found
+    listed = TileList(pairs, offsets, places, of_each, order, 0)
+    return _Placed(grid, table, listed, ids, task, count_meaningless(*tensors) + int(spoilt.sum()))
+
+
+class _Picture(torch.autograd.Function):
+    """Colours and transmittance from the parameters of a scene, which was placed."""
+
+    @staticmethod
+    def forward(ctx, placed: _Placed, *parameters: Tensor):
+        grid, number = placed.grid, placed.grid.rows * placed.grid.columns
+        image, final = torch.empty(number, 3, PIXELS, **FLOATS), torch.empty(number, PIXELS, **FLOATS)
+        needs_grad = any(ctx.needs_input_grad)
+        tape = blending.blend_region(grid, placed.tiles, placed.table, image, final, needs_grad)
+        if needs_grad:
+            ctx.save_for_backward(*parameters)
+            ctx.placed, ctx.tape, ctx.final = placed, tape, final
+        return tuple(untiled(values, grid.columns)[: grid.height, : grid.width] for values in (image, final))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *by_pixels: Tensor):
+        placed, parameters = ctx.placed, ctx.saved_tensors
+        by_tiles = [tiled(values, placed.grid.rows, placed.grid.columns) for values in by_pixels]
+        sums = blending.differentiate_region(
+            placed.grid, placed.tiles, placed.table, ctx.tape, ctx.final, *by_tiles, False
+        )
+        # in the order of the fields of a scene
+        names = ("means", "scales", "quats", "opacities", "first", "rest")
+        wanted = zip(names, parameters, ctx.needs_input_grad[1:], strict=True)
+        out = {name: zeros_like(value) if needed else None for name, value, needed in wanted}
+        task = KERNELS.structs["PlacingGradient"](
+            placing=placed.task, ids=placed.ids, drawn=len(placed.ids), sums=sums, **out
+        )
+        on_threads(len(parameters[0]) >= SEVERAL, KERNELS.library.pointsplat_place_back, task)
+        return None, *out.values()
 
 
 def picture(scene: Gaussians, camera: Camera, alpha_min: float) -> tuple[Tensor, Tensor, int] | None:
-    """Colours (H, W, 3) over black, alpha (H, W, 1) and the number of Gaussians that no camera can draw; None if the
-    pairs of Gaussians and tiles are more than :data:`MOST_PAIRS`."""
-    found = _placed(scene, camera, True, alpha_min)
-    if found is None:
+    """Colours (H, W, 3) over black, alpha (H, W, 1), both differentiable in the scene, and the number of Gaussians with
+    invalid values, of colours those that are in view; None if the pairs of Gaussians and tiles are too many for one pass."""
+    taped = torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors())
+    placed = _placed(scene, camera, True, alpha_min, taped)
+    if placed is None:
         return None
-    (task, pairs, tensors), lens = found, camera.lens
-    image, final = torch.empty(task.tiles, 3, PIXELS, **FLOATS), torch.empty(task.tiles, PIXELS, **FLOATS)
-    task.fill(image=image, final_=final, blended=torch.empty(task.tiles, **INDICES))
-    on_threads(pairs.numel() >= SEVERAL, KERNELS.library.pointsplat_blend, task)
-    colors, through = (untiled(values, task.columns)[: lens.height, : lens.width] for values in (image, final))
-    return colors, 1.0 - through, count_meaningless(*tensors)
+    colors, through = _Picture.apply(placed, *scene.tensors())
+    return colors, 1.0 - through, placed.skipped
 
 
 def weights(scene: Gaussians, camera: Camera, alpha_min: float) -> Tensor | None:
     """Blending weight of each Gaussian, summed over the pixels of a picture, (N,); None as for :func:`picture`."""
-    found = _placed(scene, camera, False, alpha_min)
-    return found and blending.weigh(*found[:2], len(scene))
+    placed = _placed(scene, camera, False, alpha_min)
+    if placed is None:
+        return None
+    pairs, offsets, *_ = placed.tiles
+    return blending.weigh(blending.task_of(placed.table, placed.grid, pairs, offsets, offsets), pairs, len(scene))
 
 
 def can_draw(scene: Gaussians, wanted: bool | None) -> bool:
-    """Whether the kernels draw a scene: float32, on a CPU, without gradients. ``wanted`` as ``compiled`` of
+    """Whether the kernels draw a scene: float32, on a CPU. ``wanted`` as ``compiled`` of
     :func:`~pointsplat_ns.rasterization`."""
-    if torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors()):
-        return False
     return KERNELS.usable_for(wanted, scene.means)

@@ -71,7 +71,8 @@ def render_with_alpha(
     :func:`render`."""
     drawn = None
     with suitable_threads(scene.device):
-        if backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
+        fixed = not (view.viewmat.requires_grad and torch.is_grad_enabled())
+        if fixed and backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
             drawn = pictures.picture(scene, camera_to(scene, view), QUALITIES[quality])
         if drawn is None:
             colors = scene.features_dc, scene.features_rest

@@ -116,8 +116,8 @@ class CompiledColor(torch.autograd.Function):
         wanted = ctx.needs_input_grad
         # a constant has no direction
         of_directions = torch.empty_like(directions) if wanted[0] and ctx.degree else None
-        of_first = _zeros_like(first) if wanted[1] else None
-        of_rest = _zeros_like(rest) if wanted[2] else None
+        of_first = zeros_like(first) if wanted[1] else None
+        of_rest = zeros_like(rest) if wanted[2] else None
         _call_kernels(
             directions, first, rest, ids, ctx.degree, colors,
             grad_colors=grad.contiguous(), grad_directions=of_directions, grad_first=of_first, grad_rest=of_rest,
@@ -125,7 +125,7 @@ class CompiledColor(torch.autograd.Function):
         return of_directions, of_first, of_rest, None, None
 
 
-def _zeros_like(coefficients: Tensor) -> Tensor:
+def zeros_like(coefficients: Tensor) -> Tensor:
     """By NumPy, which takes memory that the system has zeroed: rows that are not seen are not written, nor paid for."""
     return torch.from_numpy(np.zeros(coefficients.shape, np.float32))
 

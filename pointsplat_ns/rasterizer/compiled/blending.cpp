@@ -7,7 +7,7 @@
 
 #include <type_traits>
 
-#include "lanes.h"
+#include "gradients.h"
 
 namespace {
 
@@ -15,7 +15,6 @@ constexpr int PIXELS = TILE * TILE;
 constexpr int CHUNK = 32;    // Gaussians between two checks for saturation, and between two kept transmittances; a bit each
 constexpr int GRAB = 4;      // tiles that a thread takes at once
 constexpr int AHEAD = 16;    // pairs that are fetched early
-constexpr int MOMENTS = 6;   // w, w^2, dv, dv^2, w dv, 1
 constexpr int COLOR = 6;     // first column of the colours in the table
 constexpr float HALF = 0.5f * (TILE - 1);
 constexpr float ROUNDING = 1e-3f;  // log2 alpha: no pixel that is drawn is left out
@@ -328,15 +327,10 @@ void pointsplat_chain(const float* sums, int64_t columns, const float* cov2d, co
                       int64_t count, float* grad_means2d, float* grad_cov2d, float* grad_det, float* grad_opacities,
                       int64_t* next) {
     each_gaussian(next, count, [&](int64_t i) {
-        const float* sum = sums + i * columns;
-        const float w = sum[0], ww = sum[1], v = sum[2], vv = sum[3], wv = sum[4], one = sum[5];
-        const float xy = cov2d[3 * i + 1], yy = cov2d[3 * i + 2], a = yy / det[i], r = xy / yy, d = 1.0f / yy;
-        const float grad_x = a * w, grad_a = -0.5f * ww, grad_r = a * wv, grad_d = -0.5f * vv;
-        grad_means2d[2 * i] = grad_x, grad_means2d[2 * i + 1] = d * v - r * grad_x;
-        grad_cov2d[3 * i] = 0.0f, grad_cov2d[3 * i + 1] = grad_r * d;
-        grad_cov2d[3 * i + 2] = grad_a / det[i] - (grad_r * r + grad_d * d) * d;
-        grad_det[i] = -grad_a * a / det[i];
-        grad_opacities[i] = one / opacities[i];
+        float mean2d[2], cov[3];
+        moments_back(sums + i * columns, cov2d[3 * i + 1], cov2d[3 * i + 2], det[i], opacities[i], mean2d, cov, grad_det[i],
+                     grad_opacities[i]);
+        std::copy_n(mean2d, 2, grad_means2d + 2 * i), std::copy_n(cov, 3, grad_cov2d + 3 * i);
     });
 }
 

@@ -102,11 +102,12 @@ def differentiate_region(
     grad_final: Tensor,  # [tiles, 64]
     absgrad: bool,
 ) -> Tensor:
-    """Moments, colour gradients and absolute gradients of the Gaussians from one region, (M, MOMENTS + D [+ 2])."""
+    """Moments, colour gradients and absolute gradients of the Gaussians of a table from one region, (rows of the table,
+    MOMENTS + D [+ 2]); any numbers for those that are not in the tiles' order."""
     library = KERNELS.library
     pairs, count = tiles.gaussians.numel(), tiles.order.numel()
     columns = MOMENTS + table.shape[1] - 6 + (2 if absgrad else 0)
-    sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(count, columns)
+    sums, out = grad_image.new_empty(pairs, columns), grad_image.new_empty(len(table), columns)
     task = task_of(table, grid, tiles.gaussians, tiles.offsets, tape.chunks, tiles.top)
     task.fill(
         final_=final, before=tape.before, blended=tape.blended, grad_image=grad_image.contiguous(),

@@ -1,9 +1,9 @@
-// What one camera draws, in one pass over the Gaussians, for pictures without gradients, float32 on a CPU.
+// What one camera draws, in one pass over the Gaussians, and the gradients by them in another, for float32 on a CPU.
 //
-// pictures.py calls this file where it was built, then lists the tiles and blends as for any picture. It does what
-// projection.cpp and colors.cpp do one after the other, without what lies between.
+// pictures.py calls this file where it was built, and lists the tiles and blends as for any picture between both. It does
+// what projection.cpp and colors.cpp do one after the other, without what lies between.
 
-#include "camera.h"
+#include "gradients.h"
 #include "harmonics.h"
 
 extern "C" {
@@ -17,7 +17,17 @@ struct Placing {
     float* table;      // [N, 6 + channels], as of pointsplat_tabulate; rows of Gaussians that are not drawn stay as they are
     int64_t* ids;      // [N] Gaussians that are drawn, those of each range from where the range begins
     double* depths;    // [N] of these
-    int64_t* counts;   // [ranges] how many are drawn
+    int64_t *counts, *spoilt;  // [ranges] how many are drawn, and how many are not because of their colours
+};
+
+struct PlacingGradient {
+    Placing placing;     // of three channels
+    const int64_t* ids;  // [M] Gaussians that are drawn, ascending
+    int64_t drawn;       // M
+    const float* sums;   // [N, MOMENTS + 3] of the pixels of each, of these
+    // By the parameters of the scene, of which the standard deviations and opacities are exponentials and sigmoids: zeros
+    // before; or null.
+    float *means, *quats, *scales, *opacities, *first, *rest;
 };
 
 }  // extern "C"
@@ -25,6 +35,12 @@ struct Placing {
 namespace {
 
 constexpr int GEOMETRY = 6;  // columns of the table before the colours
+
+template <int DEGREE>
+void fetch_rest(const Placing& task, const Lanes& lanes) {
+    for (int64_t row : lanes.rows)
+        for (int k = 0; DEGREE > 0 && k < task.rest_row; k += 16) __builtin_prefetch(task.rest + task.rest_row * row + k);
+}
 
 // Colours of up to eight Gaussians; NaN where a coefficient is not finite.
 template <int DEGREE>
@@ -41,9 +57,10 @@ void color_lanes(const Placing& task, const Lanes& lanes, const Position& at, fl
     }
 }
 
-// Writes what is drawn of up to eight Gaussians from place ``to`` on; returns the next place.
+// Writes what is drawn of up to eight Gaussians from place ``to`` on; returns the next place. Adds those whose colours have no
+// meaning to ``spoilt``.
 template <int DEGREE>
-int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
+int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to, int64_t& spoilt) {
     constexpr int CHANNELS = DEGREE < 0 ? 0 : 3, COLUMNS = GEOMETRY + CHANNELS;
     const Camera& camera = task.camera;
     const Position at(camera, lanes, task.scene.means);
@@ -56,7 +73,10 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
         if (!flat.drawn[lane]) continue;
         bool usable = true;  // no colour is NaN
         for (int c = 0; c < CHANNELS; ++c) usable &= colors[lane][c] < task.most_color;
-        if (!usable) continue;
+        if (!usable) {
+            ++spoilt;
+            continue;
+        }
         float* row = task.table + COLUMNS * lanes.rows[lane];
         for (int i = 0; i < GEOMETRY; ++i) row[i] = rows[i][lane];
         for (int c = 0; c < CHANNELS; ++c) row[GEOMETRY + c] = colors[lane][c];
@@ -69,16 +89,58 @@ int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to) {
 template <int DEGREE>
 void place_all(const Placing& task, int64_t* next) {
     each_range(next, task.scene.count, [&](int64_t range, int64_t first, int64_t last) {
-        int64_t candidates[RANGE], to = first;
+        int64_t candidates[RANGE], to = first, spoilt = 0;
         const int64_t number = find_candidates(task.camera, task.scene, first, last, candidates);
         for (int64_t at = 0; at < number; at += LANES) {
             const Lanes lanes(candidates + at, number - at);
-            for (int64_t row : lanes.rows)
-                for (int k = 0; DEGREE > 0 && k < task.rest_row; k += 16)
-                    __builtin_prefetch(task.rest + task.rest_row * row + k);
-            to = place_lanes<DEGREE>(task, lanes, to);
+            fetch_rest<DEGREE>(task, lanes);
+            to = place_lanes<DEGREE>(task, lanes, to, spoilt);
         }
-        task.counts[range] = to - first;
+        task.counts[range] = to - first, task.spoilt[range] = spoilt;
+    });
+}
+
+// The gradients of up to eight Gaussians.
+template <int DEGREE>
+void place_back_lanes(const PlacingGradient& task, const Lanes& lanes) {
+    const Placing& placing = task.placing;
+    const Camera& camera = placing.camera;
+    const Position at(camera, lanes, placing.scene.means);
+    const Shape shape(camera, at, lanes, placing.scene);
+    const Lane opacity = lanes.load(placing.scene.opacities);
+    const Lane alpha = camera.antialiased ? opacity * shape.compensation(camera) : opacity;
+    Lane sums[MOMENTS + 3], std[3], direction[3];
+    lanes.load(task.sums, sums);
+    lanes.load(placing.scene.scales, std);
+    Gradient grad = {};
+    moments_back(sums, shape.xy, shape.yy + camera.eps2d, shape.det, alpha, grad.mean2d, grad.cov2d, grad.det, grad.alpha);
+    float by_color[LANES][3];
+    for (int lane = 0; lane < LANES; ++lane)
+        for (int c = 0; c < 3; ++c) {
+            const float color = placing.table[(GEOMETRY + 3) * lanes.rows[lane] + GEOMETRY + c];
+            by_color[lane][c] = color > 0.0f ? sums[MOMENTS + c][lane] : 0.0f;
+        }
+    for (int i = 0; i < 3; ++i) direction[i] = narrow(at.direction[i]);
+    color_back<DEGREE>(direction, lanes.count, lanes.rows, by_color, placing.first, placing.rest, placing.rest_row,
+                       task.first, task.rest, DEGREE ? &grad.direction : nullptr);
+    project_back(camera, lanes, at, shape, opacity, grad, nullptr);
+    for (int i = 0; i < 3; ++i) grad.std[i] *= std[i];
+    lanes.store(task.means, grad.direction);
+    lanes.store(task.quats, grad.quat);
+    lanes.store(task.scales, grad.std);
+    lanes.store(task.opacities, grad.alpha * (1.0f - opacity) * opacity);
+}
+
+template <int DEGREE>
+void place_back_all(const PlacingGradient& task, int64_t* next) {
+    each_range(next, task.placing.scene.count, [&](int64_t, int64_t first, int64_t last) {
+        const int64_t *end = task.ids + task.drawn, *from = std::lower_bound(task.ids, end, first);
+        const int64_t* to = std::lower_bound(from, end, last);
+        for (; from < to; from += LANES) {
+            const Lanes lanes(from, to - from);
+            fetch_rest<DEGREE>(task.placing, lanes);
+            place_back_lanes<DEGREE>(task, lanes);
+        }
     });
 }
 
@@ -93,6 +155,15 @@ void pointsplat_place(const Placing* task, int64_t* next) {
         case 1: return place_all<1>(*task, next);
         case 2: return place_all<2>(*task, next);
         case 3: return place_all<3>(*task, next);
+    }
+}
+
+void pointsplat_place_back(const PlacingGradient* task, int64_t* next) {
+    switch (task->placing.degree) {
+        case 0: return place_back_all<0>(*task, next);
+        case 1: return place_back_all<1>(*task, next);
+        case 2: return place_back_all<2>(*task, next);
+        case 3: return place_back_all<3>(*task, next);
     }
 }
 
