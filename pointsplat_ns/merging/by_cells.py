@@ -40,7 +40,7 @@ from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state, principal_axes
 from pointsplat_ns.merging.visibility import views_and_weights
 from pointsplat_ns.system.progress import Progress, silent
-from pointsplat_ns.system.tensors import DOUBLES, FLAGS, FLOATS, INDICES
+from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.system.workers import Workers
 from pointsplat_ns.views import Views
@@ -181,12 +181,9 @@ class _Work:
             found = self.cells.scratch.known(_round(number, cell))
             left += len(found["means"])
             prices.append(found["prices"])
-        most = min(left - self.k, most_pairs(left, self.settings))
-        joined = torch.cat(prices)
-        chosen = torch.zeros(len(joined), **FLAGS)
-        chosen[joined.sort(stable=True).indices[:most]] = True
-        parts = chosen.split([len(part) for part in prices])
-        return {**{f"{cell}": part for cell, part in enumerate(parts)}, "left": left - chosen.sum()}
+        chosen = lowest(prices, min(left - self.k, most_pairs(left, self.settings)))
+        merged = sum(int(part.sum()) for part in chosen)
+        return {**{f"{cell}": part for cell, part in enumerate(chosen)}, "left": torch.tensor(left - merged, **INDICES)}
 
     def state(self, number: int, cell: int) -> tuple[State, Tensor]:
         """The state of a cell after ``number`` rounds, and the group (n,) of each participant in it."""
@@ -238,6 +235,30 @@ class _Work:
             if groups.any_merged:
                 groups = regrouped(participants, groups, self.settings)
             row_table(scene_maker(participants, groups, self.settings)[1](size_change)).tofile(path)
+
+
+def lowest(parts: list[Tensor], most: int) -> list[Tensor]:
+    """Which numbers of some parts, float32 and not below 0, are the ``most`` lowest of all, bool as the parts; of equal
+    ones the first. The parts are counted by the upper and by the lower half of their bits, which are in the order of the
+    numbers: sorting them together would take five times their memory."""
+    bits = [part.view(torch.int32) for part in parts]
+    limit, rest = 0, most
+    for shift, values in ((16, 1 << 15), (0, 1 << 16)):
+        counts = torch.zeros(values, **INDICES)
+        for part in bits:
+            within = part if shift else part[part >> 16 == limit >> 16]
+            counts += torch.bincount((within >> shift) & 0xFFFF, minlength=values)
+        sums = counts.cumsum(0)
+        digit = min(int(torch.searchsorted(sums, rest)), values - 1)  # the last if there are fewer
+        rest -= int(sums[digit] - counts[digit])
+        limit |= digit << shift
+    chosen = []
+    for part in bits:
+        equal = part == limit
+        first = equal & (equal.cumsum(0) <= rest)
+        rest -= int(first.sum())
+        chosen.append((part < limit) | first)
+    return chosen
 
 
 def _round(number: int, cell: int) -> str:

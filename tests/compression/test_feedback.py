@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from making import assert_same_on_any_threads
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
 from pointsplat_ns.compression.optimiser import Adam, AdamSettings, nonzero_rms
 from pointsplat_ns.gaussians import PARAMETERS, Gaussians
@@ -79,6 +80,41 @@ def test_factors_in_pieces_are_those_of_the_whole(scene):
     feedback.observe(gradients(many, 0))
     expected = network(feedback.features(many, 0.5, 8))
     torch.testing.assert_close(feedback.factors(network, many, 0.5, 8), expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1.0, 1e18])
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("weighed", [False, True])
+def test_a_step_in_one_pass_is_one_after_the_other(scene, size, degree, weighed):
+    rest = torch.zeros(len(scene), (degree + 1) ** 2 - 1, 3)
+    many = scene.replace(features_rest=rest)[torch.arange(2500) % len(scene)]
+    many.opacities[0], many.opacities[1], many.scales[2, 0] = math.inf, -math.inf, -math.inf
+    factors = torch.rand(len(many), 6, generator=torch.Generator().manual_seed(2)) if weighed else None
+
+    def after(dtype, at_once):
+        now, adam = many.to(dtype), Adam(many.to(dtype), AdamSettings(faster=4.0, damping=0.01))
+        for seed in range(3):
+            if at_once:
+                now = adam.stepped(now, gradients(now, seed, size), lambda _: (0.5, factors))
+            else:
+                adam.observe(gradients(now, seed, size))
+                now = adam.moved(now, 0.5, factors)
+        return [*now.tensors(), *adam.state().values()]
+
+    ours, torchs, exact = after(torch.float32, True), after(torch.float32, False), after(torch.float64, True)
+    for mine, theirs, right in zip(ours, torchs, exact, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-7)
+        if size != 1e-30:  # its square is 0 in float32
+            torch.testing.assert_close(mine.double(), right, rtol=1e-4, atol=1e-6 * max(1.0, size))
+
+
+def test_a_step_is_the_same_on_any_threads(scene):
+    many = scene[torch.arange(9000) % len(scene)]
+
+    def step():
+        return Adam(many, AdamSettings()).stepped(many, gradients(many, 1), lambda _: (1.0, None)).tensors()
+
+    assert_same_on_any_threads(step)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e18])

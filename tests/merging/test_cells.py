@@ -1,5 +1,6 @@
 """Merging cell by cell: the count, the seams, damaged steps, and what is the same as in memory."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,7 +19,7 @@ from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.merging import MERGING, MergeSettings, merge
-from pointsplat_ns.merging.by_cells import merge_file
+from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.cells import Scratch, divided
 
 
@@ -124,7 +125,7 @@ from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.merging import cells
-from pointsplat_ns.merging.by_cells import merge_file
+from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.settings import MERGING
 from lab.common.timing import start_of_peak, status_bytes
 from pointsplat_ns.system.memory import give_back_freed_memory
@@ -155,3 +156,22 @@ def test_memory_is_that_of_a_cell_and_not_of_the_scene(tmp_path):
     grown = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     # Of a cell, 8 times as much, with what the C library and mapped files hold; of one cell for all, five times that.
     assert grown < 14 * most * (prune_file.MEMORY.cell + sh_bytes)
+
+
+@pytest.mark.parametrize("kind", ["spread", "few", "equal", "extreme"])
+def test_the_lowest_of_all_parts_are_those_of_a_stable_sort(kind):
+    generator = torch.Generator().manual_seed(4)
+    numbers = torch.rand(5000, generator=generator)
+    if kind == "few":
+        numbers = (numbers * 7).floor()
+    elif kind == "equal":
+        numbers = torch.full((5000,), 0.25)
+    elif kind == "extreme":
+        numbers = 10 ** (numbers.double() * 83 - 45).float()  # from the least above 0 to infinity
+        numbers[::9], numbers[::11] = 0.0, math.inf
+    parts = [*numbers.split([0, 1, 1999, 0, 3000])]
+    for most in (0, 1, 17, 2500, 4999, 5000, 6000):
+        wanted = torch.zeros(5000, dtype=torch.bool)
+        wanted[numbers.sort(stable=True).indices[:most]] = True
+        chosen = lowest(parts, most)
+        assert [len(part) for part in chosen] == [0, 1, 1999, 0, 3000] and torch.equal(torch.cat(chosen), wanted)

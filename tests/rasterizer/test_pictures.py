@@ -104,6 +104,63 @@ def test_pictures_are_those_of_the_general_way_to_rounding(degree, quality, monk
 def test_pictures_are_the_same_on_any_threads():
     scene, view = scene_of(count=12_000), view_of()
     assert_same_on_any_threads(lambda: [*drawing.render_with_alpha(scene, view), pixels_of(scene, view)])
+    assert_same_on_any_threads(lambda: gradients(scene, view))
+
+
+def gradients(scene, view, only=slice(None)):
+    """Gradients of a fixed sum over a picture and its alpha by the parameters of a scene."""
+    leaves = scene.map(lambda value: value.detach().clone().requires_grad_())
+    with torch.enable_grad():
+        image, alpha = drawing.render_with_alpha(leaves, view)
+        slope = torch.linspace(0.2, 1, WIDTH)[None, :, None].to(image)
+        total = (image * slope).sin().sum() + (alpha * slope).square().sum()
+    return torch.autograd.grad(total, leaves.tensors()[only])
+
+
+@needs_compiler
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("change", [None, *CHANGES], ids=lambda change: change.__name__ if change else "ordinary")
+def test_gradients_are_those_of_torch_and_as_near_to_float64(change, mode, monkeypatch):
+    scene, view = scene_of(), view_of(mode)
+    scene, view = change(scene, view) if change else (scene, view)
+    ours, exact = gradients(scene, view), gradients(scene.to(torch.float64), view)
+    monkeypatch.setattr(pictures, "can_draw", lambda *_: False)
+    general = gradients(scene, view)
+    for got, others, wanted in zip(ours, general, exact, strict=True):
+        assert got.isfinite().all() and wanted.any()
+        # norms, as a pixel at a threshold may fall either way
+        assert (got - others).norm() <= 2e-5 * others.norm()
+        assert (got - wanted).norm() <= 2 * (others - wanted).norm() + 1e-6 * wanted.norm()
+
+
+@needs_compiler
+@pytest.mark.parametrize("degree", range(4))
+def test_a_gradient_alone_is_as_among_others_and_of_many_pairs_as_of_few(degree, monkeypatch):
+    scene, view = scene_of(degree), view_of()
+    found = gradients(scene, view)
+    for which, wanted in enumerate(found):
+        assert torch.equal(gradients(scene, view, slice(which, which + 1))[0], wanted)
+    monkeypatch.setattr(pictures, "MOST_PAIRS", 10)
+    for ours, others in zip(found, gradients(scene, view), strict=True):
+        assert (ours - others).norm() <= 2e-5 * others.norm()
+
+
+@needs_compiler
+def test_a_camera_that_moves_has_gradients():
+    view = view_of()
+    view = replace(view, viewmat=view.viewmat.clone().requires_grad_())
+    (grad,) = torch.autograd.grad(render(scene_of(), view).sum(), view.viewmat)
+    assert grad[:3].abs().sum() > 0
+
+
+@needs_compiler
+def test_a_scene_that_changes_before_its_gradient_is_refused():
+    leaves = scene_of(1, 50).map(lambda value: value.clone().requires_grad_())
+    total = render(leaves, view_of()).sum()
+    with torch.no_grad():
+        leaves.means.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
 
 
 @pytest.mark.parametrize("count", [0, 1])
