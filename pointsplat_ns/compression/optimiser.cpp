@@ -1,7 +1,7 @@
 // A step of Adam, for float32 on a CPU.
 //
-// optimiser.py calls this file where it was built, and does the same in torch. Threads take ranges of Gaussians, and nothing
-// is summed, so that the number of threads changes nothing.
+// optimiser.py calls this file where it was built, and does the same in torch. Threads take ranges of Gaussians, and
+// nothing is summed, so that their number changes nothing.
 
 #include <vector>
 
@@ -12,7 +12,7 @@ extern "C" {
 // One parameter of ``count`` Gaussians, ``columns`` numbers each.
 struct AdamStep {
     const float *values, *gradient;          // [K, columns]
-    float *first, *second, *moved;           // as the values: averages of the gradient and of its square, and the new values
+    float *first, *second, *moved;           // as the values: averages of the gradient and of its square, new values
     const float* factors;                    // [K, kinds] of the rate, of which column ``kind`` counts; null for 1
     int64_t count, columns, kind, kinds;
     float rate, epsilon;

@@ -108,8 +108,8 @@ class Adam:
 
     @torch.no_grad()
     def stepped(self, scene: Gaussians, gradients: dict[str, Tensor], choose: Choose) -> Gaussians:
-        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are chosen of the scene, by a
-        compiled kernel in one pass where it was built."""
+        """A scene after a step: :meth:`observe`, then :meth:`moved` with the arguments that are chosen of the scene; in
+        one pass, by a compiled kernel, where it was built."""
         share, factors = choose(scene)
         if not KERNELS.usable_for(None, *scene.tensors()):
             self.observe(gradients)

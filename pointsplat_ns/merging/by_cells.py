@@ -239,8 +239,8 @@ class _Work:
 
 def lowest(parts: list[Tensor], most: int) -> list[Tensor]:
     """Which numbers of some parts, float32 and not below 0, are the ``most`` lowest of all, bool as the parts; of equal
-    ones the first. The parts are counted by the upper and by the lower half of their bits, which are in the order of the
-    numbers: sorting them together would take five times their memory."""
+    ones the first. They are counted by the upper half of their bits, then by the lower one, which are in the order of
+    the numbers: sorting all together would take five times their memory."""
     bits = [part.view(torch.int32) for part in parts]
     limit, rest = 0, most
     for shift, values in ((16, 1 << 15), (0, 1 << 16)):

@@ -1,6 +1,6 @@
-"""Pictures by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass over the Gaussians,
-then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`). The gradients by all parameters of
-a scene take another pass.
+"""Pictures by compiled kernels (``compiled/pictures.cpp``): projection, colours and tiles in one pass over the
+Gaussians, then blending as for any picture (:mod:`~pointsplat_ns.rasterizer.compiled.blending`). Gradients by the
+parameters of a scene take another pass.
 
 :func:`~pointsplat_ns.rasterization` gives the same pictures and gradients to rounding.
 """
@@ -70,6 +70,8 @@ def _placed(scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, t
     if found is None:
         return None
     pairs, offsets, places = found
+    if places is None or of_each is None:
+        places = of_each = order[:0]
     listed = TileList(pairs, offsets, places, of_each, order, 0)
     return _Placed(grid, table, listed, ids, task, count_meaningless(*tensors) + int(spoilt.sum()))
 
@@ -92,9 +94,9 @@ class _Picture(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, *by_pixels: Tensor):
         placed, parameters = ctx.placed, ctx.saved_tensors
-        by_tiles = [tiled(values, placed.grid.rows, placed.grid.columns) for values in by_pixels]
+        by_color, by_final = (tiled(values, placed.grid.rows, placed.grid.columns) for values in by_pixels)
         sums = blending.differentiate_region(
-            placed.grid, placed.tiles, placed.table, ctx.tape, ctx.final, *by_tiles, False
+            placed.grid, placed.tiles, placed.table, ctx.tape, ctx.final, by_color, by_final, False
         )
         # in the order of the fields of a scene
         names = ("means", "scales", "quats", "opacities", "first", "rest")
@@ -109,7 +111,7 @@ class _Picture(torch.autograd.Function):
 
 def picture(scene: Gaussians, camera: Camera, alpha_min: float) -> tuple[Tensor, Tensor, int] | None:
     """Colours (H, W, 3) over black, alpha (H, W, 1), both differentiable in the scene, and the number of Gaussians with
-    invalid values, of colours those that are in view; None if the pairs of Gaussians and tiles are too many for one pass."""
+    invalid values (colours are checked in view); None if the pairs of Gaussians and tiles are too many for one pass."""
     taped = torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors())
     placed = _placed(scene, camera, True, alpha_min, taped)
     if placed is None:

@@ -78,7 +78,7 @@ void sum_camera(const Lanes& lanes, const Position& at, const Shape& s, const La
     }
 }
 
-// From the gradients by what a camera sees to those by the Gaussians; adds those by the camera to ``sums``, if it is there.
+// From the gradients by what a camera sees to those by the Gaussians; adds those by the camera to ``sums``, if there are any.
 void project_back(const Camera& camera, const Lanes& lanes, const Position& at, const Shape& s, Lane opacity, Gradient& grad,
                   double* sums) {
     Lane grad_p1[3], grad_p2[3];

@@ -99,7 +99,8 @@ void color_back(Lane (&direction)[3], int count, const int64_t (&rows)[LANES], c
     std::memcpy(lanes, grad_basis, sizeof(lanes));
     basis_backward<DEGREE>(direction, lanes, *grad_direction);
     const Lane along_itself = dot(direction, *grad_direction);
-    for (int i = 0; i < 3; ++i) (*grad_direction)[i] = ((*grad_direction)[i] - direction[i] * along_itself) * inverse_length;
+    for (int i = 0; i < 3; ++i)
+        (*grad_direction)[i] = ((*grad_direction)[i] - direction[i] * along_itself) * inverse_length;
 }
 
 }  // namespace

@@ -14,7 +14,7 @@ struct Placing {
     const float *first, *rest;       // SH coefficients, [N, 3] and [N, K - 1, 3]
     int64_t rest_row, degree;        // numbers of the others of a Gaussian; degree of the basis, -1 for no colours
     float most_color;
-    float* table;      // [N, 6 + channels], as of pointsplat_tabulate; rows of Gaussians that are not drawn stay as they are
+    float* table;      // [N, 6 + channels], as of pointsplat_tabulate; rows of Gaussians that are not drawn stay as is
     int64_t* ids;      // [N] Gaussians that are drawn, those of each range from where the range begins
     double* depths;    // [N] of these
     int64_t *counts, *spoilt;  // [ranges] how many are drawn, and how many are not because of their colours
@@ -57,8 +57,8 @@ void color_lanes(const Placing& task, const Lanes& lanes, const Position& at, fl
     }
 }
 
-// Writes what is drawn of up to eight Gaussians from place ``to`` on; returns the next place. Adds those whose colours have no
-// meaning to ``spoilt``.
+// Writes what is drawn of up to eight Gaussians from place ``to`` on; returns the next place. Adds those whose colours have
+// no meaning to ``spoilt``.
 template <int DEGREE>
 int64_t place_lanes(const Placing& task, const Lanes& lanes, int64_t to, int64_t& spoilt) {
     constexpr int CHANNELS = DEGREE < 0 ? 0 : 3, COLUMNS = GEOMETRY + CHANNELS;

@@ -1,7 +1,7 @@
 // Projection of Gaussians into the image of one camera, for float32 on a CPU, and its gradient.
 //
-// projection.py calls this file where it was built; ewa.py does the same in torch. Threads take ranges of Gaussians of fixed size, and nothing
-// is summed across ranges, so that the number of threads changes nothing.
+// projection.py calls this file where it was built; ewa.py does the same in torch. Threads take ranges of Gaussians of
+// fixed size, and nothing is summed across ranges, so that the number of threads changes nothing.
 
 #include "gradients.h"
 
