@@ -8,6 +8,7 @@ check that all agree.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -54,7 +55,7 @@ def mean_ssim(image: Tensor, other: Tensor, compiled: bool | None = None) -> Ten
 def _blur(maps: Tensor) -> Tensor:
     """Gaussian blur of (B, K, H, W) where the whole window fits: (B, K, H - 10, W - 10)."""
     channels = maps.shape[1]
-    weight = _window(maps).repeat(channels, 1, 1, 1)  # (K, 1, 1, 11)
+    weight = _window(maps.dtype, maps.device).repeat(channels, 1, 1, 1)  # (K, 1, 1, 11)
     if maps.shape[3] >= SSIM_WINDOW:
         maps = F.conv2d(maps, weight, groups=channels)
     if maps.shape[2] >= SSIM_WINDOW:
@@ -62,11 +63,13 @@ def _blur(maps: Tensor) -> Tensor:
     return maps
 
 
-def _window(like: Tensor) -> Tensor:
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Weights (11,) along one side."""
-    offset = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
-    weight = torch.exp(-offset.square() / (2 * 1.5**2))  # sigma of 1.5 pixels
-    return weight / weight.sum()
+    with torch.inference_mode(False):  # it is kept, and gradients may be taken through it later
+        offset = torch.arange(SSIM_WINDOW, dtype=dtype, device=device) - SSIM_WINDOW // 2
+        weight = torch.exp(-offset.square() / (2 * 1.5**2))  # sigma of 1.5 pixels
+        return weight / weight.sum()
 
 
 def _suited(image: Tensor, other: Tensor) -> bool:
@@ -121,7 +124,7 @@ def _call(
 ) -> None:
     planes, height, row, step, bands = shape
     task = KERNELS.structs["Similarity"](
-        image=image, other=other, window=_window(image), planes=planes, height=height, row=row, step=step, bands=bands,
+        image=image, other=other, window=_window(image.dtype, image.device), planes=planes, height=height, row=row, step=step, bands=bands,
         partials=partials, sums=sums, grad=grad,
     )  # fmt: skip
     on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)

@@ -77,47 +77,58 @@ def _placed(scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, t
 
 
 class _Picture(torch.autograd.Function):
-    """Colours and transmittance from the parameters of a scene, which was placed."""
+    """Picture and alpha from the parameters of a scene, which was placed."""
 
     @staticmethod
-    def forward(ctx, placed: _Placed, *parameters: Tensor):
+    def forward(ctx, placed: _Placed, background: Tensor, *parameters: Tensor):
         grid, number = placed.grid, placed.grid.rows * placed.grid.columns
         image, final = torch.empty(number, 3, PIXELS, **FLOATS), torch.empty(number, PIXELS, **FLOATS)
         needs_grad = any(ctx.needs_input_grad)
         tape = blending.blend_region(grid, placed.tiles, placed.table, image, final, needs_grad)
+        colors, through = (untiled(of, grid.columns)[: grid.height, : grid.width] for of in (image, final))
+        colors = colors + through * background
+        drawn = colors.clamp(0, 1)
         if needs_grad:
             ctx.save_for_backward(*parameters)
-            ctx.placed, ctx.tape, ctx.final = placed, tape, final
-        return tuple(untiled(values, grid.columns)[: grid.height, : grid.width] for values in (image, final))
+            ctx.placed, ctx.tape, ctx.final, ctx.background, ctx.inside = (
+                placed,
+                tape,
+                final,
+                background,
+                drawn == colors,
+            )
+        return drawn, 1.0 - through
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *by_pixels: Tensor):
+    def backward(ctx, by_picture: Tensor, by_alpha: Tensor):
         placed, parameters = ctx.placed, ctx.saved_tensors
-        by_color, by_final = (tiled(values, placed.grid.rows, placed.grid.columns) for values in by_pixels)
+        by_colors = by_picture * ctx.inside
+        by_through = (by_colors * ctx.background).sum(-1, keepdim=True) - by_alpha
+        by_color, by_final = (tiled(by, placed.grid.rows, placed.grid.columns) for by in (by_colors, by_through))
         sums = blending.differentiate_region(
             placed.grid, placed.tiles, placed.table, ctx.tape, ctx.final, by_color, by_final, False
         )
         # in the order of the fields of a scene
         names = ("means", "scales", "quats", "opacities", "first", "rest")
-        wanted = zip(names, parameters, ctx.needs_input_grad[1:], strict=True)
+        wanted = zip(names, parameters, ctx.needs_input_grad[2:], strict=True)
         out = {name: zeros_like(value) if needed else None for name, value, needed in wanted}
         task = KERNELS.structs["PlacingGradient"](
             placing=placed.task, ids=placed.ids, drawn=len(placed.ids), sums=sums, **out
         )
         on_threads(len(parameters[0]) >= SEVERAL, KERNELS.library.pointsplat_place_back, task)
-        return None, *out.values()
+        return None, None, *out.values()
 
 
-def picture(scene: Gaussians, camera: Camera, alpha_min: float) -> tuple[Tensor, Tensor, int] | None:
-    """Colours (H, W, 3) over black, alpha (H, W, 1), both differentiable in the scene, and the number of Gaussians with
-    invalid values (colours are checked in view); None if the pairs of Gaussians and tiles are too many for one pass."""
+def picture(
+    scene: Gaussians, camera: Camera, background: Tensor, alpha_min: float
+) -> tuple[Tensor, Tensor, int] | None:
+    """Picture (H, W, 3) over a background (3,), in [0, 1], alpha (H, W, 1), both differentiable in the scene, and the
+    number of Gaussians with invalid values (colours are checked in view); None if the pairs of Gaussians and tiles are
+    too many for one pass."""
     taped = torch.is_grad_enabled() and any(value.requires_grad for value in scene.tensors())
     placed = _placed(scene, camera, True, alpha_min, taped)
-    if placed is None:
-        return None
-    colors, through = _Picture.apply(placed, *scene.tensors())
-    return colors, 1.0 - through, placed.skipped
+    return placed and (*_Picture.apply(placed, background.to(scene.means), *scene.tensors()), placed.skipped)
 
 
 def weights(scene: Gaussians, camera: Camera, alpha_min: float) -> Tensor | None:

@@ -69,18 +69,17 @@ def render_with_alpha(
 ) -> tuple[Tensor, Tensor]:
     """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
     :func:`render`."""
-    drawn = None
     with suitable_threads(scene.device):
-        fixed = not (view.viewmat.requires_grad and torch.is_grad_enabled())
+        fixed = not (torch.is_grad_enabled() and (view.viewmat.requires_grad or view.background.requires_grad))
         if fixed and backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
-            drawn = pictures.picture(scene, camera_to(scene, view), QUALITIES[quality])
-        if drawn is None:
-            colors = scene.features_dc, scene.features_rest
-            options = {"sh_degree": scene.sh_degree, "quality": quality, "backend": backend}
-            image, alpha = _rasterized(scene, view, colors, **options)
-        else:
-            image, alpha, skipped = drawn
-            _warn_of(skipped, scene)
+            drawn = pictures.picture(scene, camera_to(scene, view), view.background, QUALITIES[quality])
+            if drawn is not None:
+                *found, skipped = drawn
+                _warn_of(skipped, scene)
+                return found[0], found[1]
+        colors = scene.features_dc, scene.features_rest
+        options = {"sh_degree": scene.sh_degree, "quality": quality, "backend": backend}
+        image, alpha = _rasterized(scene, view, colors, **options)
         return (image + (1 - alpha) * view.background.to(image)).clamp(0, 1), alpha
 
 
