@@ -83,8 +83,8 @@ def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_p
             found.append((i, j, least[mutual]))
             taken[i] = taken[j] = True
     first, second, key = (torch.cat(parts) for parts in zip(*found, strict=True))
-    prices, order = (key >> 32).int().view(torch.float32).sort(stable=True)
-    return first[order], second[order], prices
+    prices, order = (key >> 32).int().sort(stable=True)  # integers are sorted in a tenth of the time of floats
+    return first[order], second[order], prices.view(torch.float32)
 
 
 def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
