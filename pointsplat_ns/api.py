@@ -184,8 +184,8 @@ def compact(
         effort: "instant" takes no steps; "quick" and "thorough" take 192 and 1200, up to four times as many for
             more than 20,000 Gaussians.
         seconds: duration of the repair, in place of ``effort``; Ctrl-C ends it earlier and keeps the scene so far.
-        photos: also train on photos, named as for :func:`prune`, by 1200 ("quick") or 12000 ("thorough") steps, or for
-            ``seconds``.
+        photos: train on photos in place of the repair, named as for :func:`prune`, by 2400 ("quick") or 12000
+            ("thorough") steps, or for ``seconds``.
         target_db: in place of ``keep``, least PSNR of the file, after all repairs, against the given scene's renders,
             over the pixels that it covers, dB. The smallest such file is searched for.
         target_format: format of the file whose size or PSNR counts: ".ply", ".spz", ".sog", ...

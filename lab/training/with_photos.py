@@ -33,6 +33,7 @@ from lab.common.running import folder_of_run
 from lab.common.ways import count_of
 from lab.judge.record import FOLDER, read, write_rows
 from lab.judge.scenes import PHOTOS
+from pointsplat_ns.compression.requests import PHOTO_STEPS
 from pointsplat_ns.io import read_scene
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.runs import METHOD_NAMES
@@ -67,7 +68,7 @@ PAGE = f"""# With the photos at hand
 - CPU seconds are of a process on one thread of a busy machine: equal work differs by up to a half. All ways need the
   dense training as well.
 - PSNR (dB) and LPIPS are means over all held-out photos.
-- `{COMPACTED}` trains for 1,600 steps.
+- `{COMPACTED}` trains for {PHOTO_STEPS["quick"]:,} steps.
 - "{SCORES["lightgaussian"]}" and PUP-3DGS train the Gaussians with the highest scores as `{COMPACTED}` does, for as
   many CPU seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
 """

@@ -103,7 +103,7 @@ def compact(
             more than 20,000 Gaussians.
         seconds: duration of the repair, in place of --effort; by default none is set. Ctrl-C ends it earlier and writes
             the scene so far.
-        photos: after the repair also train on photos, by 1200 steps (quick) or 12000 (thorough), or for --seconds.
+        photos: in place of the repair train on photos, by 2400 steps (quick) or 12000 (thorough), or for --seconds.
             Photos in and outside of the steps say whether it helped. For a run, those of its dataset; for any scene,
             those in FOLDER, with the poses of --poses, or of a file of cameras there, above it or beside the scene.
         target_db: in place of --keep, the smallest file that has at least this PSNR against renders of the dense scene,

@@ -13,7 +13,7 @@ from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.acceptance import ACCEPTANCE, SMALL_GAIN, Comparison
 from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
-from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, photo_repair
+from pointsplat_ns.compression.photo_repair import photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
@@ -38,8 +38,9 @@ def compact_scene(
     photos: Photos | None = None,
 ) -> Compacted:
     """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
-    result are on the device of ``dense``. By default views are sampled. With ``photos``, the scene is
-    trained on them last, if the request has a budget for it.
+    result are on the device of ``dense``. By default views are sampled. With ``photos``, and a budget for
+    it, the scene is trained on them, and repaired only where that harms: a repair before brings nothing (a tenth of
+    fox, figure, ray and vr_project: within 0.1 dB in held-out photos, and within 0.2 dB in sampled views).
 
     Refinement and repair are accepted by comparing renders with those of the dense scene
     (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
@@ -67,13 +68,15 @@ def compact_scene(
     stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
         stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
-    error_left = last_kept(stages).after
-    if judge is not None and error_left is not None and error_left.psnr < math.inf and not request.repair.empty:
-        stages.append(_repaired(last_kept(stages), at_work, request, judge, views, progress))
-    interrupted = stages[-1].interrupted
-    if photos is not None and request.photos is not None and not request.photos.empty and not interrupted:
+    trained = False
+    if photos is not None and request.photos is not None and not request.photos.empty:
         stages.append(_trained(last_kept(stages), at_work, request.photos, photos, reference, views, progress))
-        interrupted = stages[-1].interrupted
+        trained = stages[-1].accepted
+    left = last_kept(stages)
+    if judge is not None and not (trained or stages[-1].interrupted or request.repair.empty):
+        if left.after is not None and left.after.psnr < math.inf:
+            stages.append(_repaired(left, at_work, request, judge, views, progress))
+    interrupted = stages[-1].interrupted
     if pruned.limit is not None:
         stages += rounding_stage(last_kept(stages), pruned.limit, reference)
     seen = (views.text,) if views.origin and views.text not in pruned.notes else ()
@@ -123,7 +126,7 @@ def _trained(
     progress("training on photos", 0.0)
     report = functools.partial(progress, "training on photos")
     trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = "" if trained.lost <= PHOTO_REPAIR.most_lost else f"other photos lose {trained.lost:.1f} dB"
+    reason = "" if trained.lost <= 0 else f"other photos lose {trained.lost:.1f} dB"
     reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else SMALL_GAIN  # NaN too
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)

@@ -33,7 +33,7 @@ FEW = 20_000
 """Number of Gaussians above which a repair takes more steps, in more views."""
 
 
-PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 1600, "thorough": 12000}
+PHOTO_STEPS: dict[Effort, int] = {"instant": 0, "quick": 2400, "thorough": 12000}
 """Number of steps on photos of each effort."""
 
 

@@ -124,7 +124,7 @@ def _call(
 ) -> None:
     planes, height, row, step, bands = shape
     task = KERNELS.structs["Similarity"](
-        image=image, other=other, window=_window(image.dtype, image.device), planes=planes, height=height, row=row, step=step, bands=bands,
-        partials=partials, sums=sums, grad=grad,
+        image=image, other=other, window=_window(image.dtype, image.device), planes=planes, height=height, row=row,
+        step=step, bands=bands, partials=partials, sums=sums, grad=grad,
     )  # fmt: skip
     on_threads(planes * bands > 1, KERNELS.library.pointsplat_similarity, task)

@@ -68,11 +68,12 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(faster, un
     scenes = [hollow_ball.replace(features_dc=hollow_ball.features_dc + change) for change in (unseen, 0.4)]
     views = views_from_within((5.0, 0.0, 0.0), 18, 48, 36)
     photos = [Example(view, render(scenes[index % 8 > 0], view).detach()) for index, view in enumerate(views)]
-    request = CompactRequest(PruneRequest(300), photos=PhotoBudget("quick"))
+    request = CompactRequest(PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick"))
     result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
-    stage, kept = result.stages[-1], text.startswith("trained")
+    stage, kept = result.stages[1], text.startswith("trained")
     assert stage.name == "photos" and stage.accepted == kept and text in result.verdict
-    assert result.scene is result.stages[-1 if kept else 0].scene and result.verdict.startswith("not") != kept
+    assert [stage.name for stage in result.stages[2:]] == ([] if kept else ["repair"])
+    assert (result.scene is stage.scene) == kept and result.verdict.startswith("not") != kept
 
 
 def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollow_ball, photos):
