@@ -14,7 +14,14 @@ from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, gradients_of, size_factors
 from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
 from pointsplat_ns.compression.quality import through_file
-from pointsplat_ns.compression.requests import PHOTO_STEPS, CompactRequest, PhotoBudget, PruneRequest, RepairBudget
+from pointsplat_ns.compression.requests import (
+    PHOTO_STEPS,
+    STEPS,
+    CompactRequest,
+    PhotoBudget,
+    PruneRequest,
+    RepairBudget,
+)
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import sample_views
@@ -30,6 +37,7 @@ CPU = torch.device("cpu")
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     monkeypatch.setitem(PHOTO_STEPS, "quick", 40)
+    monkeypatch.setitem(STEPS, "quick", 4)
 
 
 @pytest.fixture(scope="module")
