@@ -3,6 +3,7 @@
 // pictures.py calls this file where it was built, and lists the tiles and blends as for any picture between both. It does
 // what projection.cpp and colors.cpp do one after the other, without what lies between.
 
+#include "camera.h"
 #include "gradients.h"
 #include "harmonics.h"
 

@@ -3,6 +3,7 @@
 // projection.py calls this file where it was built; ewa.py does the same in torch. Threads take ranges of Gaussians of
 // fixed size, and nothing is summed across ranges, so that the number of threads changes nothing.
 
+#include "camera.h"
 #include "gradients.h"
 
 extern "C" {
