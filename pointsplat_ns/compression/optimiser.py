@@ -67,8 +67,8 @@ class Adam:
         """Extent of the scene at the start, scene units."""
         self.rates = {name: settings.faster * rates[name] * (self.reach if name == "means" else 1.0) for name in RATES}
         self._settings = settings
-        self._first = {name: torch.zeros_like(value) for name, value in scene.items()}
-        self._second = {name: torch.zeros_like(value) for name, value in scene.items()}
+        self._first = {name: value.new_zeros(value.shape) for name, value in scene.items()}
+        self._second = {name: value.new_zeros(value.shape) for name, value in scene.items()}
         self._damping = dict.fromkeys(RATES, 0.0)
         self._directions: dict[str, Tensor] = {}
         self._steps = 0
@@ -116,7 +116,7 @@ class Adam:
             return self.moved(scene, share, factors)
         self._steps += 1
         factors = None if factors is None else factors.to(scene.means).contiguous()
-        moved = {name: torch.empty_like(value) for name, value in scene.items()}
+        moved = {name: value.new_empty(value.shape) for name, value in scene.items()}
         beta, square_beta = self._settings.betas
         for kind, (name, values) in enumerate(scene.items()):
             self._damp(name, gradients[name])

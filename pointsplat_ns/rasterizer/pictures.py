@@ -90,13 +90,8 @@ class _Picture(torch.autograd.Function):
         drawn = colors.clamp(0, 1)
         if needs_grad:
             ctx.save_for_backward(*parameters)
-            ctx.placed, ctx.tape, ctx.final, ctx.background, ctx.inside = (
-                placed,
-                tape,
-                final,
-                background,
-                drawn == colors,
-            )
+            ctx.placed, ctx.tape, ctx.final = placed, tape, final
+            ctx.background, ctx.inside = background, drawn == colors
         return drawn, 1.0 - through
 
     @staticmethod

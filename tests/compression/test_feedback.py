@@ -89,6 +89,7 @@ def test_a_step_in_one_pass_is_one_after_the_other(scene, size, degree, weighed)
     rest = torch.zeros(len(scene), (degree + 1) ** 2 - 1, 3)
     many = scene.replace(features_rest=rest)[torch.arange(2500) % len(scene)]
     many.opacities[0], many.opacities[1], many.scales[2, 0] = math.inf, -math.inf, -math.inf
+    many = many.replace(features_rest=many.features_rest.mT.contiguous().mT)  # other strides
     factors = torch.rand(len(many), 6, generator=torch.Generator().manual_seed(2)) if weighed else None
 
     def after(dtype, at_once):
