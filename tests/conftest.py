@@ -148,24 +148,14 @@ def make_refined_run() -> Callable:
 
 
 @pytest.fixture(scope="session")
-def make_hollow_ball() -> Callable[..., Gaussians]:
-    """A function that makes the inside of a ball of radius 2 about (5, 0, 0), covered with opaque blobs, and an outlier
-    far away."""
-
-    def make(n: int = 1500, seed: int = 0, degree: int = 2) -> Gaussians:
-        scene = ball(n, degree, seed, math.log(0.12))
-        noise = 0.3 * torch.randn(n, 3, generator=torch.Generator().manual_seed(seed + 1))
-        scene = scene.replace(means=scene.means + torch.tensor([5.0, 0.0, 0.0]), features_dc=scene.features_dc + noise)
-        scene.means[0] = 1e6
-        return scene
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def hollow_ball(make_hollow_ball) -> Gaussians:
-    """Shared by all tests here, so do not write to it."""
-    return make_hollow_ball()
+def hollow_ball() -> Gaussians:
+    """The inside of a ball of radius 2 about (5, 0, 0), covered with opaque blobs, and an outlier far away; shared by
+    all tests, so do not write to it."""
+    scene = ball(1500, 2, log_size=math.log(0.12))
+    noise = 0.3 * torch.randn(1500, 3, generator=torch.Generator().manual_seed(1))
+    scene = scene.replace(means=scene.means + torch.tensor([5.0, 0.0, 0.0]), features_dc=scene.features_dc + noise)
+    scene.means[0] = 1e6
+    return scene
 
 
 @pytest.fixture(scope="session")

@@ -30,10 +30,6 @@ def absolute(scene):
     return scene.means.double().numpy() + np.array(scene.offset or (0, 0, 0))
 
 
-def at_utm(views):
-    return replace(views, viewmats=views.viewmats.double()).relative_to(tuple(-value for value in UTM))
-
-
 @pytest.mark.parametrize(("order", "text"), [("<", False), (">", False), ("<", True)])
 def test_doubles_keep_their_digits_beside_an_offset(tmp_path, caplog, order, text):
     scene = cloud(300)
@@ -106,7 +102,8 @@ def test_poses_of_a_file_are_in_the_frame_of_the_scene_s_file(tmp_path):
     scene = ball(400)
     with_doubles(scene, tmp_path / "a.ply")
     views = ps.sample_views(scene, 3, width=96, height=64)
-    written(inria(at_utm(views)), tmp_path / "cameras.json")
+    there = replace(views, viewmats=views.viewmats.double()).relative_to(tuple(-value for value in UTM))
+    written(inria(there), tmp_path / "cameras.json")
     dense, given, _ = read_found(tmp_path / "a.ply", tmp_path / "cameras.json")
     with torch.no_grad():
         assert float(ps.psnr(ps.render(dense, given), ps.render(scene, views)).mean()) > 50

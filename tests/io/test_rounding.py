@@ -97,16 +97,13 @@ def test_rows_of_a_file_that_shrinks_are_refused(tmp_path):
         rows.read(40, 50)
 
 
-def rows_of(n, dims, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    centres = torch.randn(300, dims, generator=generator)
-    return centres[torch.randint(300, (n,), generator=generator)] + 0.01 * torch.randn(n, dims, generator=generator)
-
-
 @pytest.mark.parametrize("different", [1, 300, 700])
 def test_sh_of_few_different_rows_keep_them(different):
     """A palette of twice the entries may then have no error at all."""
-    rows = 3 * rows_of(different, 9)[torch.arange(4000) % different].reshape(4000, 3, 3)
+    generator = torch.Generator().manual_seed(0)
+    centres = torch.randn(300, 9, generator=generator)[torch.randint(300, (different,), generator=generator)]
+    rows = centres + 0.01 * torch.randn(different, 9, generator=generator)
+    rows = 3 * rows[torch.arange(4000) % different].reshape(4000, 3, 3)
     rounding = rounding_for(30.0, 1)
     rest = format_to_write(".sog").rounded(cloud(4000, sh_degree=1).replace(features_rest=rows), rounding).features_rest
     assert 0.95 * different <= len(rest.flatten(1).unique(dim=0)) <= different

@@ -18,9 +18,6 @@ from pointsplat_ns.io import read_scene, write_ply
 from pointsplat_ns.merging import MERGING, merge
 from pointsplat_ns.refiner import Refiner, preset, save_refiner
 
-PATHS = sorted(camera_paths.FOLDER.glob("*.json"))
-
-
 VIEWS = {
     "scene": "small",
     "about": "The walls of a room, from its middle.",
@@ -43,7 +40,7 @@ def rows_of(results: Path) -> list[dict]:
     return json.loads(results.read_text())["rows"]
 
 
-@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(camera_paths.FOLDER.glob("*.json")), ids=lambda path: path.stem)
 def test_a_path_that_ships_has_sixteen_upright_views_from_different_places(path):
     found, views = camera_paths.read_path(path), camera_paths.views_of(path, 320)
     assert len(views) == 16 and 60 <= found.field_of_view <= 70

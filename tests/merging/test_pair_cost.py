@@ -18,8 +18,6 @@ from pointsplat_ns.system.kernels import KERNELS
 
 needs_compiler = pytest.mark.skipif(bool(KERNELS.why_missing), reason=KERNELS.why_missing)
 
-compiled_or_not = pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
-
 
 def state_of(scene: Gaussians, size: float = 1.0) -> State:
     """The state before the first round, of all Gaussians, around the origin."""
@@ -96,7 +94,7 @@ def extremes(n: int) -> Gaussians:
     )
 
 
-@compiled_or_not
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_compiler), False])
 def test_costs_are_finite_and_not_negative_at_the_extremes(compiled):
     state, others = state_of(extremes(200)), (torch.arange(200)[:, None] + torch.arange(8)) % 200
     costs = pair_costs(state, others.to(torch.int32), compiled=compiled)

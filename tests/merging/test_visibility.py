@@ -33,11 +33,6 @@ def wall(z: float, rows: int = 32, size: float = 2.0) -> Gaussians:
     return splats(means, torch.tensor([size / rows, size / rows, 0.01]).log(), 4.0)
 
 
-def two_walls() -> Gaussians:
-    """Two walls, one behind the other, alike to the last digit in all else."""
-    return Gaussians.cat([wall(-0.5), wall(0.5)])
-
-
 def weights_of(scene: Gaussians, views: Views) -> torch.Tensor:
     return covered_per_area(scene, torch.arange(len(scene)), views)
 
@@ -60,7 +55,7 @@ def test_weights_hardly_depend_on_the_size_of_gaussians_even_below_a_pixel():
 
 @pytest.mark.parametrize("max_count", [5000, 700, 3])  # of more, some are drawn for all
 def test_an_occluded_gaussian_has_a_small_weight_also_where_some_are_drawn_for_all(max_count):
-    scene = two_walls()
+    scene = Gaussians.cat([wall(-0.5), wall(0.5)])  # alike to the last digit in all else
     participants = Participants.of(scene, torch.arange(len(scene)))
     _, found = views_and_weights(participants, of_origin((0, 0, -4)), replace(MERGING, max_count_drawn=max_count))
     assert found.shape == (len(scene),) and found.dtype == torch.float32

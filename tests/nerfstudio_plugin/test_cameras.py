@@ -27,13 +27,11 @@ from pointsplat_ns.nerfstudio_plugin.frames import Frames, UndistortedDataset
 from pointsplat_ns.nerfstudio_plugin.replica.dataparser import ReplicaDataParserConfig
 from pointsplat_ns.views import EPS2D, NEAR_PLANE, Views
 
-SEED = 20
-
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 
 
 def some_cameras(num: int = 3) -> Cameras:
-    generator = torch.Generator().manual_seed(SEED)
+    generator = torch.Generator().manual_seed(20)
     turn = torch.linalg.qr(torch.randn(num, 3, 3, generator=generator))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
     poses = torch.cat([turn, torch.randn(num, 3, 1, generator=generator)], dim=2)

@@ -39,13 +39,8 @@ def flipped(poses: torch.Tensor) -> torch.Tensor:
     return poses * poses.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
-def scaled(by: float):
-    def change(poses: torch.Tensor) -> torch.Tensor:
-        poses = poses.clone()
-        poses[:, :3, 3] *= by
-        return poses
-
-    return change
+def farther(poses: torch.Tensor) -> torch.Tensor:
+    return poses * poses.new_tensor([1.0, 1.0, 1.0, 50.0])
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
@@ -56,7 +51,7 @@ def test_views_around_an_object_pass_at_any_scale_and_number(scale, count):
     assert (faults.checked, faults.text) == (min(count, 8), "")
 
 
-@pytest.mark.parametrize("wrong", [flipped, invert_rigid, scaled(50.0)])
+@pytest.mark.parametrize("wrong", [flipped, invert_rigid, farther])
 def test_cameras_that_look_past_the_scene_are_told(wrong):
     faults = pose_faults(statue(), moved(around(8.0), wrong))
     assert faults.text.startswith(f"{8 - faults.empty} of 8 cameras see anything of the scene") and faults.empty > 4

@@ -20,7 +20,7 @@ from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.photos import frame as module
 from pointsplat_ns.photos.posed_photos import PosedPhotos, read_with_photos
-from posing import inria, name_of, nerfstudio, write_colmap_binary, write_colmap_text, write_photos
+from posing import inria, name_of, nerfstudio, write_photos, write_sparse
 
 COUNT = 18
 
@@ -51,18 +51,14 @@ def between(poses: torch.Tensor, others: torch.Tensor) -> Similarity:
     return Similarity(matrix, scale, others[0, :3, 3] - scale * matrix @ poses[0, :3, 3])
 
 
-UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""What nerfstudio's processing undoes: its world has z up, COLMAP's has y down."""
-
-
 @pytest.mark.parametrize("kind", ["text", "binary", "root", "transforms.json", "cameras.json", "named"])
 def test_poses_are_found_where_projects_have_them(kind, scene, views, tmp_path, said):
     folder = write_photos(scene, views, tmp_path / "images")
     poses = None
     if kind in ("text", "named"):
-        poses = write_colmap_text(views, tmp_path / ("sparse/0" if kind == "text" else "elsewhere"))
+        poses = write_sparse(views, tmp_path / ("sparse/0" if kind == "text" else "elsewhere"))
     elif kind in ("binary", "root"):
-        write_colmap_binary(views, tmp_path / "sparse/0" if kind == "binary" else tmp_path)
+        write_sparse(views, tmp_path / "sparse/0" if kind == "binary" else tmp_path, ".bin")
     else:
         content = nerfstudio(views) if kind == "transforms.json" else inria(views)
         (tmp_path / kind).write_text(json.dumps(content))
@@ -81,9 +77,10 @@ def test_poses_are_found_where_projects_have_them(kind, scene, views, tmp_path, 
 def test_turned_axes_and_other_scales_of_poses_are_found_and_named(axes, scene, views, tmp_path, said):
     folder = write_photos(scene, views, tmp_path / "images")
     poses = invert_rigid(views.viewmats.double())
-    poses[:, :3] = UP.double() @ poses[:, :3] if axes else poses[:, :3] * poses.new_tensor([1.0, 1.0, 1.0, 0.4])
+    up = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double()  # as nerfstudio's processing turns COLMAP's world
+    poses[:, :3] = up @ poses[:, :3] if axes else poses[:, :3] * poses.new_tensor([1.0, 1.0, 1.0, 0.4])
     others = invert_rigid(flip_camera_axes(poses) if axes else poses)
-    write_colmap_text(replace(views, viewmats=others), tmp_path / "sparse/0")
+    write_sparse(replace(views, viewmats=others), tmp_path / "sparse/0")
     assert same_poses(read(scene, folder).views, views, 1e-5 if axes else 2e-3)
     change = "axes x, y, z of the scene are x, z, -y of the poses, camera axes y and z turned around"
     assert f"poses are moved into the frame of the scene: {change if axes else 'positions times 2.5'}" in said.text
@@ -123,7 +120,7 @@ def test_photos_of_another_scene_are_refused_with_their_psnr(scene, views, tmp_p
     other = ball(500, seed=9)
     colors = torch.randn(500, 3, generator=torch.Generator().manual_seed(2))
     folder = write_photos(other.replace(features_dc=colors), views, tmp_path / "images")
-    write_colmap_text(views, tmp_path / "sparse/0")
+    write_sparse(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match=r"unlike the photos in the frame .* dB PSNR in 8 photos.*--poses"):
         read(scene, folder)
 
@@ -132,7 +129,7 @@ def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, sa
     folder = write_photos(scene, views, tmp_path / "images")
     for index in (3, 16):
         write_picture(1 - ps.render(scene, views[index]), folder / name_of(index))
-    write_colmap_text(views, tmp_path / "sparse/0")
+    write_sparse(views, tmp_path / "sparse/0")
     found = read(scene, folder)
     assert (len(found.training), len(found.held_out)) == (14, 2)  # no other photo is held out in its place
     [line] = [line for line in said.messages if "fit worst are left out" in line]
@@ -142,7 +139,7 @@ def test_photos_that_fit_worst_are_named_and_left_out(scene, views, tmp_path, sa
 def test_photos_that_cannot_be_read_are_named_and_left_out(scene, views, tmp_path, said):
     """Of the first, which is held out, the end is missing; the other is no photo."""
     folder = write_photos(scene, views, tmp_path / "images")
-    write_colmap_text(views, tmp_path / "sparse/0")
+    write_sparse(views, tmp_path / "sparse/0")
     first, other = folder / name_of(0), folder / name_of(5)
     first.write_bytes(first.read_bytes()[:-2000])
     other.write_bytes(b"no photo")
@@ -161,7 +158,7 @@ def test_names_that_do_not_match_are_told_with_examples_of_both(scene, views, tm
     folder = write_photos(scene, views, tmp_path / "images")
     for index, path in enumerate(sorted(folder.iterdir())):
         path.rename(folder / f"IMG_{index}.png")
-    write_colmap_text(views, tmp_path / "sparse/0")
+    write_sparse(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match=r"0 of its 18 cameras .*'frame_0.png', 'frame_1.png'; of photos: 'IMG_0.png'"):
         read(scene, folder)
 
@@ -170,7 +167,7 @@ def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, mo
     folder = write_photos(scene, views[:7], tmp_path / "images")
     with pytest.raises(DataError, match="no poses there, above it or beside the scene"):
         read(scene, folder)
-    write_colmap_text(views, tmp_path / "sparse/0")
+    write_sparse(views, tmp_path / "sparse/0")
     with pytest.raises(DataError, match="7 of its 18 cameras have a photo in .*; expected at least 8"):
         read(scene, folder)
     with pytest.raises(SceneError, match="no such file"):
@@ -187,7 +184,7 @@ def test_too_few_photos_no_poses_and_no_room_are_said(scene, views, tmp_path, mo
 def test_a_scene_that_gsplat_normalised_is_found_by_the_models_points(scene, views, tmp_path, said):
     """Axes of the points of any signs: turns of axes find the rest."""
     folder = write_photos(scene, views, tmp_path / "images")
-    model = write_colmap_text(views, tmp_path / "sparse/0")
+    model = write_sparse(views, tmp_path / "sparse/0")
     points = (scene.means.double() * torch.tensor([1.0, 0.7, 0.4])) @ torch.linalg.qr(torch.randn(3, 3).double()).Q
     rows = [f"{number} {x} {y} {z} 0 0 0 0.5 1 0" for number, (x, y, z) in enumerate(points.tolist())]
     (model / "points3D.txt").write_text("# 3D point list\n" + "\n".join(rows) + "\n")
@@ -207,7 +204,7 @@ def test_a_white_background_is_found(tmp_path, said):
     around = views_of(look_at(eyes, torch.zeros_like(eyes)), 64, 48, 5.0)
     white = replace(around, background=torch.ones(3))
     folder = write_photos(thing, white, tmp_path / "images")
-    write_colmap_text(around, tmp_path / "sparse/0")
+    write_sparse(around, tmp_path / "sparse/0")
     found = read(thing, folder)
     assert found.views.background.tolist() == found.training[0].view.background.tolist() == [1.0] * 3
     assert "white background" in said.text
@@ -216,7 +213,7 @@ def test_a_white_background_is_found(tmp_path, said):
 def test_any_scene_is_compacted_with_its_photos(scene, views, tmp_path, capsys):
     """What only photos know: other colours than those of the scene."""
     folder = write_photos(scene.replace(features_dc=scene.features_dc + 0.3), views, tmp_path / "my photos")
-    model = write_colmap_binary(views, tmp_path / "model")
+    model = write_sparse(views, tmp_path / "model", ".bin")
     ps.save(scene, tmp_path / "room.ply")
     words = ["--photos", str(folder), "--poses", str(model), "--keep", "50%"]
     main(["compact", str(tmp_path / "room.ply"), *words, "-o", str(tmp_path / "small.ply")])
@@ -229,7 +226,7 @@ def test_any_scene_is_compacted_with_its_photos(scene, views, tmp_path, capsys):
 @pytest.mark.parametrize("how", ["prune", "tradeoff"])
 def test_held_out_photos_judge_what_is_not_trained(how, scene, views, tmp_path, capsys):
     shown = scene.replace(features_dc=scene.features_dc + 0.3) if how == "tradeoff" else scene
-    folder, model = write_photos(shown, views, tmp_path / "images"), write_colmap_binary(views, tmp_path / "model")
+    folder, model = write_photos(shown, views, tmp_path / "images"), write_sparse(views, tmp_path / "model", ".bin")
     path = tmp_path / "room.ply"
     ps.save(scene, path)
     words = ["--photos", str(folder), "--poses", str(model), "--keep", "50%"]

@@ -19,7 +19,7 @@ from pointsplat_ns.io.camera_files import read_named_views
 from pointsplat_ns.io.turning import Similarity
 from pointsplat_ns.photos.posed_scene import read_found
 from pointsplat_ns.placing import run_frame
-from posing import nerfstudio, write_colmap_text, write_photos, written
+from posing import nerfstudio, write_photos, write_sparse, written
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_photos_that_lie_where_the_file_says_tell_a_wrong_frame(layout, scene, v
 
     def poses_of(views: ps.Views) -> Path:
         if layout == "colmap":
-            return write_colmap_text(views, tmp_path / "sparse" / "0")
+            return write_sparse(views, tmp_path / "sparse" / "0")
         content = nerfstudio(views)
         if layout == "nerfstudio":
             return written(content, tmp_path / "transforms.json")

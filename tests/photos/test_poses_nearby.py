@@ -12,7 +12,7 @@ from making import run_of
 from pointsplat_ns.cli import main
 from pointsplat_ns.compacting import Looking, read_source
 from pointsplat_ns.geometry.transforms import invert_rigid
-from posing import inria, nerfstudio, write_colmap_text, write_photos
+from posing import inria, nerfstudio, write_photos, write_sparse
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_poses_of_data_count_where_photos_tell_that_they_belong(kind, scene, vie
     if kind == "transforms.json":
         (tmp_path / kind).write_text(json.dumps(nerfstudio(views)))
     else:
-        write_colmap_text(views, tmp_path / "sparse" / "0")
+        write_sparse(views, tmp_path / "sparse" / "0")
     assert known(path) is None and "no photos beside it tell whether it belongs to the scene" in said.text
     write_photos(scene, views, tmp_path / "images")
     assert same(known(path), views)

@@ -176,13 +176,9 @@ def test_unusable_gaussians_are_counted_and_have_no_gradient():
         assert not grad[1:3].any() and torch.equal(grad[rest], expected)
 
 
-def centre_of(view):
-    return torch.linalg.solve(view[:3, :3], -view[:3, 3])
-
-
 def test_gaussians_at_and_across_the_camera_plane():
     scene, (view, K) = make_scene(50), camera_askew()
-    centre = centre_of(view)
+    centre = torch.linalg.solve(view[:3, :3], -view[:3, 3])
     scene[0][0] = centre  # depth and view vector exactly zero
     scene[0][1:9] = centre + (scene[0][1:9] - centre) * 1e-3
     scene[0][9:18, 2] *= -1

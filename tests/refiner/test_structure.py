@@ -79,22 +79,19 @@ def test_hilbert_codes_are_those_of_the_published_algorithm(bits):
     assert z.tolist() == [interleaved(point, bits) for point in coords.tolist()]
 
 
-def scene_at(means: torch.Tensor) -> Gaussians:
-    return normal_scene(len(means)).replace(means=means)
-
-
-def surface(n: int, seed: int = 0) -> torch.Tensor:
-    g = torch.Generator().manual_seed(seed)
+def surface(n: int) -> Gaussians:
+    """Gaussians on three sides of a cube."""
+    g = torch.Generator().manual_seed(0)
     means = torch.rand(n, 3, generator=g)
     means[torch.arange(n), torch.randint(0, 3, (n,), generator=g)] = 0.0
-    return means
+    return normal_scene(n).replace(means=means)
 
 
 def test_clusters_hold_the_points_of_a_cell_and_orders_are_permutations():
-    means = surface(800)
+    scene = surface(800)
     config = preset("full", grid=64)
-    structure = build_structure(scene_at(means), config)
-    position = structure.cube.positions(means)[structure.order] + 0.5
+    structure = build_structure(scene, config)
+    position = structure.cube.positions(scene.means)[structure.order] + 0.5
     cluster = torch.arange(800)
     for level, stride in zip(structure.levels, (1, 2, 4, 8), strict=False):
         for order, inverse in level.orders[1:]:
@@ -109,9 +106,9 @@ def test_clusters_hold_the_points_of_a_cell_and_orders_are_permutations():
 
 @pytest.mark.parametrize("n", [50, 500, 5000])
 def test_an_adapted_grid_is_the_coarsest_that_keeps_most_points_apart(n):
-    means = surface(n)
-    structure = build_structure(scene_at(means), preset("tiny"))
-    position = structure.cube.positions(means) + 0.5
+    scene = surface(n)
+    structure = build_structure(scene, preset("tiny"))
+    position = structure.cube.positions(scene.means) + 0.5
 
     def occupied(side):
         return len(torch.unique((position * side).floor().clamp(max=side - 1), dim=0))

@@ -5,19 +5,15 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from selenium.webdriver import Chrome
 
 SECONDS = 90
 """How long a test waits for what shall come; it takes a few on an idle machine."""
 
 
 @contextmanager
-def chromium() -> "Iterator[Chrome]":
+def chromium() -> Iterator:
     """A browser of its own, closed at the end. The test is skipped where Chromium or its driver is missing."""
     selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     programs = filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")))
@@ -48,7 +44,7 @@ def before_pages_load(browser, script: str) -> Iterator[None]:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
 
 
-def complaints(browser: "Chrome") -> list[str]:
+def complaints(browser) -> list[str]:
     """What the browser has logged since the last call: errors of scripts, and what the policy of a page forbade. What a
     graphics driver says of its speed is left out."""
     messages = (entry["message"] for entry in browser.get_log("browser"))

@@ -16,8 +16,6 @@ from posing import write_colmap
 WIDTH, HEIGHT, FRAMES = 64, 48, 10
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SEEDS = 300
-HIDDEN = np.s_[30:42, 10:26]
-"""Pixels that ScanNet++'s masks leave out; the photos are spoilt there."""
 HELD_OUT, BAD = (2, 5, 8), (3, 8)
 """Frames of ScanNet++'s test split, and those that it marks as bad."""
 
@@ -130,7 +128,7 @@ class Capture:
         names = self.write_photos(folder / "dslr/resized_images")
         (folder / "dslr/resized_anon_masks").mkdir()
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-        mask[HIDDEN] = 0
+        mask[30:42, 10:26] = 0  # where the photos are spoilt
         frames = []
         for number, (name, pose) in enumerate(zip(names, self.poses, strict=True)):
             photo = folder / "dslr/resized_images" / name

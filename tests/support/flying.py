@@ -2,7 +2,6 @@
 
 import base64
 import io
-import time
 
 import numpy as np
 import torch
@@ -10,19 +9,13 @@ from PIL import Image
 from torch import Tensor
 
 import pointsplat_ns as ps
+from browser import waited
 from pointsplat_ns.pages.flight import FlightFrame
-
-PATIENCE = 60.0
-"""Seconds after which a picture that is still changing is a failure. Without a GPU and beside other programs, a frame
-may take one."""
 
 
 def until(browser, condition: str) -> None:
     """Wait until a script's expression is true."""
-    end = time.monotonic() + PATIENCE
-    while not browser.execute_script(f"return {condition}"):
-        assert time.monotonic() < end, f"not {condition}; it says {message(browser)!r}"
-        time.sleep(0.02)
+    waited(lambda: browser.execute_script(f"return {condition}"), condition)
 
 
 def settle(browser) -> None:

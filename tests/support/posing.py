@@ -59,19 +59,12 @@ def write_colmap(folder: Path, suffix: str, lens: tuple, poses: dict, seeds=(), 
     return folder
 
 
-def _write_views(views: Views, folder: Path, suffix: str, model: str, extra: tuple[float, ...]) -> Path:
+def write_sparse(views: Views, folder: Path, suffix: str = ".txt", model: str = "PINHOLE", extra=()) -> Path:
+    """A model as COLMAP writes it, of cameras alone; ``extra`` are the parameters of their distortion."""
     K = views.Ks[0].tolist()
     lens = model, views.width, views.height, [K[0][0], K[1][1], K[0][2], K[1][2], *extra]
     viewmats = views.viewmats.double().numpy()
     return write_colmap(folder, suffix, lens, {name_of(index): viewmat for index, viewmat in enumerate(viewmats)})
-
-
-def write_colmap_text(views: Views, folder: Path, model: str = "PINHOLE", extra: tuple[float, ...] = ()) -> Path:
-    return _write_views(views, folder, ".txt", model, extra)
-
-
-def write_colmap_binary(views: Views, folder: Path, model: int = 1, extra: tuple[float, ...] = ()) -> Path:
-    return _write_views(views, folder, ".bin", colmap.CAMERA_MODEL_IDS[model].model_name, extra)
 
 
 def write_photos(scene: Gaussians, views: Views, folder: Path) -> Path:

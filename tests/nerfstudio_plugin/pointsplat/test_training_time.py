@@ -12,13 +12,10 @@ from pointsplat_ns.errors import PointSplatError
 from pointsplat_ns.nerfstudio_plugin.pointsplat.config import REFINER_RATES
 from pointsplat_ns.nerfstudio_plugin.pointsplat.trainer import PointSplatTrainer, rate_factor_at
 
-STEP = 10.0
-"""Seconds of a step by the test's clock."""
-
 
 @pytest.fixture(autouse=True)
 def steps_of_ten_seconds(monkeypatch):
-    monkeypatch.setattr(PointSplatTrainer, "clock", count(1000.0, STEP).__next__)
+    monkeypatch.setattr(PointSplatTrainer, "clock", count(1000.0, 10.0).__next__)
 
 
 def timed(three_rooms, folder, seconds, **changes):

@@ -102,9 +102,6 @@ def test_no_steps_are_refused_and_leave_no_folder(number, wall_scene, wall_confi
         assert not config.output_dir.exists()
 
 
-LOG = "pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log"
-
-
 def state_of(trainer):
     moments, model = trainer.optimizers.optimizers, trainer.pipeline.model
     state = {"moments": {name: optimizer.state_dict()["state"] for name, optimizer in moments.items()}}
@@ -140,7 +137,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_named(started, kind, s
     take(started, range(2))
     before = state_of(started)
     assert before["gathered"]["count"].any(), "densification has gathered something"
-    with broken(kind, range(2, 3)), mock.patch(LOG) as log:
+    with broken(kind, range(2, 3)), mock.patch("pointsplat_ns.nerfstudio_plugin.trainer.CONSOLE.log") as log:
         (metrics,) = take(started, [2])
     assert equal(state_of(started), before)
     photo = started.pipeline.datamanager.latest_photo
