@@ -21,15 +21,12 @@ from pointsplat_ns.io.formats.sog import encode_sog
 from pointsplat_ns.io.formats.splat import encode_splat
 from pointsplat_ns.io.formats.spz import encode_spz
 
-SEED = 5
-
-
 FILES = {
-    ".compressed.ply": encode_compressed_ply(cloud(300, SEED, 1)),
-    ".spz": encode_spz(cloud(300, SEED, 1)),
-    "4.spz": encode_spz4(cloud(300, SEED, 1)),
-    ".sog": encode_sog(cloud(300, SEED, 1)),
-    ".splat": encode_splat(cloud(300, SEED, 0)),
+    ".compressed.ply": encode_compressed_ply(cloud(300, 5, 1)),
+    ".spz": encode_spz(cloud(300, 5, 1)),
+    "4.spz": encode_spz4(cloud(300, 5, 1)),
+    ".sog": encode_sog(cloud(300, 5, 1)),
+    ".splat": encode_splat(cloud(300, 5, 0)),
 }
 
 

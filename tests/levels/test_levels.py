@@ -55,6 +55,12 @@ def manifest_of(folder: Path) -> dict:
     return json.loads((folder / "lod.json").read_text("utf-8"), parse_constant=refuse)
 
 
+def test_a_level_alone_is_what_prune_gives(scene, views):
+    alone = ps.lod(scene, ["50%"], views=views)[0].scene
+    assert same(alone, ps.prune(scene, "50%", views=views))
+    assert not same(alone, ps.prune(scene, "50%")), "merging looks from the views"
+
+
 def test_the_manifest_is_true_of_the_files(folder, scene, views):
     manifest = manifest_of(folder)
     assert (manifest["format"], manifest["version"]) == ("pointsplat-lod", 2)
@@ -144,8 +150,7 @@ def test_bands_are_cut_for_all_levels_and_the_error_is_against_all_bands(scene, 
     assert [level.scene.sh_degree for level in cut] == [0, 0] and cut.dense.sh_degree == 1
     assert 0 < cut[1].quality.psnr < cut[0].quality.psnr
     assert any(note.startswith("SH degree 1 cut to 0") for note in cut.notes)
-    assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views)), "as without the levels before it"
-    assert not same(cut[1].scene, ps.prune(scene, "10%", sh="0")), "merging looks from the views"
+    assert same(cut[1].scene, ps.prune(scene, "10%", sh="0", views=views))
 
 
 @pytest.fixture()

@@ -117,16 +117,13 @@ def test_no_photo_outside_of_the_folder_of_poses_is_opened(scene, views, tmp_pat
     assert [found.photo(index) for index in range(6)] == [None] * 6
 
 
-SEED = 4
-
-
-def rotation(seed=SEED):
-    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+def rotation():
+    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
     return q * torch.linalg.det(q).sign()
 
 
 def test_a_scene_that_is_moved_looks_the_same_from_cameras_that_move_along():
-    scene = cloud(300, SEED, 3).to(dtype=torch.float64)
+    scene = cloud(300, 4, 3).to(dtype=torch.float64)
     similarity = Similarity(rotation(), 2.5, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
     views, inverse = ps.sample_views(scene, 2, width=48, height=36), similarity.inverse()
     viewmats = views.viewmats.clone()
@@ -139,7 +136,7 @@ def test_a_scene_that_is_moved_looks_the_same_from_cameras_that_move_along():
 
 
 def test_up_is_turned_to_where_it_is_wanted():
-    scene = cloud(20, SEED)
+    scene = cloud(20, 4)
     for start, end in (("z", "y"), ("-y", "z"), ("x", "-x"), ("z", "z")):
         turned = ps.place(scene, up=f"{start}:{end}")
         now, wanted = (direction_of(text) for text in (start, end))
@@ -158,7 +155,7 @@ def test_the_frame_of_a_run_is_undone(tmp_path):
     turn = rotation()
     transform = torch.cat([turn, torch.tensor([[0.5], [-0.25], [1.0]])], dim=1).float()
     run = SimpleNamespace(folder=tmp_path, transform=transform, scale=0.125)
-    data = cloud(40, SEED)
+    data = cloud(40, 4)
     scene = run_frame(run).apply(data)  # what nerfstudio does to poses
     expected = 0.125 * (data.means.double() @ transform[:, :3].double().T + transform[:, 3].double())
     assert torch.allclose(scene.means.double(), expected, atol=1e-5)

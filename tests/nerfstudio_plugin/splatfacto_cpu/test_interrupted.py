@@ -20,9 +20,6 @@ from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.config import SplatfactoCpuT
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.model import SplatfactoCpuModel
 from pointsplat_ns.nerfstudio_plugin.splatfacto_cpu.trainer import takes_tiny_as_zero
 
-LATER = "2031-01-01_000000"
-"""When a training goes on that began a moment ago: in the same second it would have the same folder."""
-
 
 @pytest.fixture(autouse=True)
 def heeded():
@@ -61,7 +58,8 @@ def test_a_training_that_is_stopped_leaves_a_scene_and_can_be_gone_on_with(
     scene = read_scene(run.folder)
     assert len({len(value) for value in scene.tensors()}) == 1 and scene.usable().all() and len(scene) > 100
     again = wall_config(wall_scene, tmp_path, steps=3)
-    again.load_dir, again.timestamp = config.get_checkpoint_dir(), LATER
+    # In the same second it would have the same folder.
+    again.load_dir, again.timestamp = config.get_checkpoint_dir(), "2031-01-01_000000"
     trainer, _ = run_training(again)
     assert trainer._start_step == 11 and trainer.step == 13
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
