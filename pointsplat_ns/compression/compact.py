@@ -10,14 +10,14 @@ import time
 from dataclasses import replace
 
 from pointsplat_ns.comparing.closeness import DenseReference
-from pointsplat_ns.compression.acceptance import ACCEPTANCE, SMALL_GAIN, Comparison
+from pointsplat_ns.compression.acceptance import Comparison
 from pointsplat_ns.compression.budget_search import FileLimit, smallest_within
 from pointsplat_ns.compression.compacted import Compacted, Stage, last_kept
-from pointsplat_ns.compression.photo_repair import photo_repair
+from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, PhotoRepaired, photo_repair
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest, PhotoBudget
+from pointsplat_ns.compression.requests import CompactRequest
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -68,15 +68,17 @@ def compact_scene(
     stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
         stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
-    trained = False
+    trained, left = None, last_kept(stages)
     if photos is not None and request.photos is not None and not request.photos.empty:
-        stages.append(_trained(last_kept(stages), at_work, request.photos, photos, reference, views, progress))
-        trained = stages[-1].accepted
-    left = last_kept(stages)
-    if judge is not None and not (trained or stages[-1].interrupted or request.repair.empty):
-        if left.after is not None and left.after.psnr < math.inf:
+        progress("training on photos", 0.0)
+        report = functools.partial(progress, "training on photos")
+        trained = photo_repair(left.scene.to(at_work.device), at_work, photos, views, request.photos, report)
+    if judge is not None and left.after is not None and left.after.psnr < math.inf and not request.repair.empty:
+        if trained is None or (trained.why_not() and not trained.interrupted):
             stages.append(_repaired(left, at_work, request, judge, views, progress))
-    interrupted = stages[-1].interrupted
+    if trained is not None and photos is not None:
+        stages.append(_trained(stages, trained, photos, reference))
+    interrupted = any(stage.interrupted for stage in stages)
     if pruned.limit is not None:
         stages += rounding_stage(last_kept(stages), pruned.limit, reference)
     seen = (views.text,) if views.origin and views.text not in pruned.notes else ()
@@ -113,24 +115,15 @@ def _repaired(
     return Stage("repair", scene, after, last.after, reason, *figures)
 
 
-def _trained(
-    last: Stage,
-    dense: Gaussians,
-    budget: PhotoBudget,
-    photos: Photos,
-    reference: DenseReference | None,
-    views: ViewSource,
-    progress: Progress,
-) -> Stage:
-    """The scene after optimising against photos; ``dense`` is on the device that renders."""
-    progress("training on photos", 0.0)
-    report = functools.partial(progress, "training on photos")
-    trained = photo_repair(last.scene.to(dense.device), dense, photos, views, budget, report)
-    reason = "" if trained.lost <= 0 else f"other photos lose {trained.lost:.1f} dB"
-    reason = reason if trained.after >= trained.before + ACCEPTANCE.min_gain else SMALL_GAIN  # NaN too
+def _trained(stages: list[Stage], trained: PhotoRepaired, photos: Photos, reference: DenseReference | None) -> Stage:
+    """The scene that was trained on photos, compared with the last stage that was kept."""
+    last, device = last_kept(stages), trained.scene.device
+    most_lost = 0.0
+    if last.name == "repair":
+        trained, most_lost = trained.beside(last.scene.to(device), photos), PHOTO_REPAIR.most_lost
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
-    return Stage("photos", scene, after, last.after, reason, *figures, photos=trained)
+    return Stage("photos", scene, after, last.after, trained.why_not(most_lost), *figures, photos=trained)
 
 
 def rounding_stage(last: Stage, limit: FileLimit, reference: DenseReference | None) -> list[Stage]:
