@@ -64,10 +64,8 @@ PAGE = f"""# With the photos at hand
 `lab/training/with_photos.py` measured [with_photos.json](with_photos.json) and writes this page from it. Constants of
 `{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
 
-- Figures of a scene are CPU seconds, PSNR and LPIPS, in this order; "-" was not measured.
-- CPU seconds are of a process on one thread of a busy machine: equal work differs by up to a half. All ways need the
-  dense training as well.
-- PSNR (dB) and LPIPS are means over all held-out photos.
+- Figures of a scene are CPU seconds, PSNR (dB) and LPIPS, means over held-out photos; "-" was not measured.
+- CPU seconds are of one thread of a busy machine: equal work differs by up to a half.
 - `{COMPACTED}` trains for {PHOTO_STEPS["quick"]:,} steps.
 - "{SCORES["lightgaussian"]}" and PUP-3DGS train the Gaussians with the highest scores as `{COMPACTED}` does, for as
   many CPU seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
