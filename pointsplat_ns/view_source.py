@@ -173,7 +173,7 @@ class ViewSource:
         if known is None or not left:
             yield from self.sampled(seed, count, drawn_side)
             return
-        others = _in_turn(self._at_resolution(known)[left], seed, drawn_side)
+        others = _shuffled(self._at_resolution(known)[left], seed, drawn_side)
         if len(left) > len(compared):
             yield from others
         else:
@@ -186,12 +186,12 @@ class ViewSource:
         """Sampled views without end, in the order and of the sizes of :meth:`others`, which has the arguments."""
         compared, views = self.compared(), self.sampler.views(count, seed + 1)
         views = replace(views, background=compared.background, rasterize_mode=compared.rasterize_mode)
-        for turn, view in enumerate(_in_turn(views, seed, drawn_side)):
+        for turn, view in enumerate(_shuffled(views, seed, drawn_side)):
             opposite = self._known is None and turn % 5 == 4  # the viewer's background is unknown
             yield replace(view, background=1 - view.background) if opposite else view
 
 
-def _in_turn(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
+def _shuffled(views: Views, seed: int, drawn_side: int) -> Iterator[View]:
     """Views in random order, each once before any is repeated, then of another size; without end. A view that comes
     again is the same object."""
     sizes, generator = [[*of_size] for of_size in several_sizes(views, drawn_side)], random.Random(seed)

@@ -83,8 +83,10 @@ class PhotoRepaired:
     """Mean PSNR of another scene in the compared photos, dB: of that before the first step, or of a repaired one."""
     after: float
     """The same of ``scene``, dB."""
-    lost: float
-    """How much lower the mean PSNR of ``scene`` is than the other's in photos that take part in no step, dB."""
+    unseen_before: float
+    """Mean PSNR of that scene in photos that take part in no step, dB."""
+    unseen: float
+    """The same of ``scene``, dB."""
     used: int
     """Number of photos of the steps."""
     compared: int
@@ -99,13 +101,19 @@ class PhotoRepaired:
         is."""
         if not self.after >= self.before + ACCEPTANCE.min_gain:  # NaN too
             return SMALL_GAIN
-        return f"other photos lose {self.lost:.1f} dB" if self.lost > most_lost else ""
+        lost = self.unseen_before - self.unseen
+        return f"other photos lose {lost:.1f} dB" if lost > most_lost else ""
 
     def beside(self, other: Gaussians, photos: Photos) -> PhotoRepaired:
         """The same, compared with another scene in the same photos."""
-        _, compared, unseen = _roles(len(photos))
-        lost = mean_psnr(other, photos, unseen) - mean_psnr(self.scene, photos, unseen)
-        return replace(self, before=mean_psnr(other, photos, compared), lost=lost)
+        before, unseen_before = _psnrs(other, photos)
+        return replace(self, before=before, unseen_before=unseen_before)
+
+
+def _psnrs(scene: Gaussians, photos: Photos) -> tuple[float, float]:
+    """Mean PSNR in the compared photos, and in photos that take part in no step, dB."""
+    _, compared, unseen = _roles(len(photos))
+    return mean_psnr(scene, photos, compared), mean_psnr(scene, photos, unseen)
 
 
 def _roles(count: int) -> tuple[list[int], list[int], list[int]]:
@@ -141,11 +149,11 @@ def photo_repair(
         raise DataError(f"{len(photos)} photos to train on; expected at least two, one of them to compare with")
     run = OptimisationRun(budget)
     used, compared, _ = _roles(len(photos))
+    before, unseen_before = _psnrs(scene, photos)
     last = run.take(scene, _scenes(scene, _examples(photos, used, dense, views), views, run), progress)
-    after = mean_psnr(last, photos, compared)
-    counts = (len(used), len(compared), run.count)
-    trained = PhotoRepaired(last, math.nan, after, math.nan, *counts, run.seconds, run.interrupted)
-    return trained.beside(scene, photos)
+    after, unseen = _psnrs(last, photos)
+    psnrs, counts = (before, after, unseen_before, unseen), (len(used), len(compared), run.count)
+    return PhotoRepaired(last, *psnrs, *counts, run.seconds, run.interrupted)
 
 
 def _scenes(

@@ -64,16 +64,9 @@ def _placed(scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, t
     rows = projection.kept_rows(counts)
     ids = ids[rows]
     order = ids[tiles.by_depth(projection.depths_behind_nearest(depths[rows]))]
-    of_each = torch.zeros_like(order) if taped else None
     most = MOST_PAIRS // 12 if taped else MOST_PAIRS
-    found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, of_each, most)
-    if found is None:
-        return None
-    pairs, offsets, places = found
-    if places is None or of_each is None:
-        places = of_each = order[:0]
-    listed = TileList(pairs, offsets, places, of_each, order, 0)
-    return _Placed(grid, table, listed, ids, task, count_meaningless(*tensors) + int(spoilt.sum()))
+    found = tiles.listed(tiles.boxed(table, order, grid), grid, 0, grid.rows, taped, most)
+    return found and _Placed(grid, table, found, ids, task, count_meaningless(*tensors) + int(spoilt.sum()))
 
 
 class _Picture(torch.autograd.Function):

@@ -53,12 +53,9 @@ def camera_centre(viewmat: Tensor) -> Tensor:
     last row is not 0, 0, 0, 1.
     """
     rows = viewmat.tolist()
-    try:
-        centre = torch.linalg.solve(viewmat[:3, :3], -viewmat[:3, 3])
-    except torch.linalg.LinAlgError:
-        centre = None
-    if centre is None or not all(math.isfinite(value) for row in rows for value in row):
-        raise ValueError(f"viewmat is {rows}; expected finite numbers and a rotation") from None
+    centre, singular = torch.linalg.solve_ex(viewmat[:3, :3], -viewmat[:3, 3])
+    if int(singular) or not all(math.isfinite(value) for row in rows for value in row):
+        raise ValueError(f"viewmat is {rows}; expected finite numbers and a rotation")
     if not _close(rows[3], (0.0, 0.0, 0.0, 1.0)):
         raise ValueError(
             f"viewmat has the last row {rows[3]}; expected 0, 0, 0, 1: it takes world to camera, row by row"

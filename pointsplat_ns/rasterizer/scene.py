@@ -74,9 +74,9 @@ def render_with_alpha(
         if fixed and backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
             drawn = pictures.picture(scene, camera_to(scene, view), view.background, QUALITIES[quality])
             if drawn is not None:
-                *found, skipped = drawn
+                image, alpha, skipped = drawn
                 _warn_of(skipped, scene)
-                return found[0], found[1]
+                return image, alpha
         colors = scene.features_dc, scene.features_rest
         options = {"sh_degree": scene.sh_degree, "quality": quality, "backend": backend}
         image, alpha = _rasterized(scene, view, colors, **options)

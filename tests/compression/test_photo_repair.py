@@ -63,8 +63,8 @@ def test_unseen_photos_are_in_no_step_and_the_others_in_turn(hollow_ball, pruned
     photo_repair(pruned, hollow_ball, photos, FewViews(hollow_ball), PhotoBudget("quick"))
     unseen = [id(photo) for photo in photos[::8]]
     # 35 of 40 steps take a photo, 5 a sampled view; 12 photos of steps and 3 others are compared.
-    assert len(taken) == 35 + 2 * 15 and taken[35:47] == taken[-12:] and taken[47:50] == taken[50:53] == unseen
-    assert {*taken[:15]} == {*taken[15:30]} == {id(photo) for photo in photos} - {*unseen}
+    assert len(taken) == 35 + 2 * 15 and taken[:15] == taken[-15:] and taken[12:15] == unseen
+    assert {*taken[15:30]} == {*taken[30:45]} == {id(photo) for photo in photos} - {*unseen}
 
 
 @pytest.mark.parametrize(

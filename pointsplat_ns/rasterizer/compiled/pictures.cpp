@@ -110,9 +110,8 @@ void place_back_lanes(const PlacingGradient& task, const Lanes& lanes) {
     const Shape shape(camera, at, lanes, placing.scene);
     const Lane opacity = lanes.load(placing.scene.opacities);
     const Lane alpha = camera.antialiased ? opacity * shape.compensation(camera) : opacity;
-    Lane sums[MOMENTS + 3], std[3], direction[3];
+    Lane sums[MOMENTS + 3], direction[3];
     lanes.load(task.sums, sums);
-    lanes.load(placing.scene.scales, std);
     Gradient grad = {};
     moments_back(sums, shape.xy, shape.yy + camera.eps2d, shape.det, alpha, grad.mean2d, grad.cov2d, grad.det, grad.alpha);
     float by_color[LANES][3];
@@ -125,7 +124,7 @@ void place_back_lanes(const PlacingGradient& task, const Lanes& lanes) {
     color_back<DEGREE>(direction, lanes.count, lanes.rows, by_color, placing.first, placing.rest, placing.rest_row,
                        task.first, task.rest, DEGREE ? &grad.direction : nullptr);
     project_back(camera, lanes, at, shape, opacity, grad, nullptr);
-    for (int i = 0; i < 3; ++i) grad.std[i] *= std[i];
+    for (int i = 0; i < 3; ++i) grad.std[i] *= shape.std[i];
     lanes.store(task.means, grad.direction);
     lanes.store(task.quats, grad.quat);
     lanes.store(task.scales, grad.std);

@@ -44,28 +44,26 @@ def _task(ellipses: Ellipses, grid: Grid, top: int, bottom: int, **lists: Tensor
 
 
 def listed(
-    ellipses: Ellipses, grid: Grid, top: int, bottom: int, counts: Tensor | None = None, most_pairs: float = math.inf
-) -> tuple[Tensor, Tensor, Tensor | None] | None:
-    """``gaussians`` and ``offsets`` of the :class:`TileList` of the rows of tiles from ``top`` to ``bottom`` - 1; its
-    ``places``, given ``counts`` (M,) of zeros, to which the pairs of each Gaussian are added; None if there are more
-    than ``most_pairs`` pairs."""
+    ellipses: Ellipses, grid: Grid, top: int, bottom: int, taped: bool = True, most_pairs: float = math.inf
+) -> TileList | None:
+    """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`; without ``places`` and ``counts``, which only gradients
+    need, unless it is ``taped``; None if there are more than ``most_pairs`` pairs."""
     first, last = ellipses.boxes[:, 0].clamp_min(top), ellipses.boxes[:, 1].clamp_max(bottom - 1)
     strips = torch.empty(int((last - first + 1).clamp_min_(0).sum()), 2, dtype=torch.int32, device="cpu")
     offsets = torch.zeros((bottom - top) * grid.columns + 1, **INDICES)
-    task = _task(ellipses, grid, top, bottom, strips=strips, offsets=offsets, counts=counts)
+    counts = torch.zeros(len(ellipses.order) if taped else 0, **INDICES)
+    task = _task(ellipses, grid, top, bottom, strips=strips, offsets=offsets, counts=counts if taped else None)
     KERNELS.library.pointsplat_count(task)
     offsets = torch.cumsum(offsets, 0)
     total = int(offsets[-1])
     if total > most_pairs:
         return None
-    gaussians, places = torch.empty(total, **INDICES), None if counts is None else torch.empty(total, **INDICES)
-    task.fill(offsets=offsets, gaussians=gaussians, places=places)
+    gaussians, places = torch.empty(total, **INDICES), torch.empty(total if taped else 0, **INDICES)
+    task.fill(offsets=offsets, gaussians=gaussians, places=places if taped else None)
     KERNELS.library.pointsplat_list(task)
-    return gaussians, offsets, places
+    return TileList(gaussians, offsets, places, counts, ellipses.order, top)
 
 
 def pairs_of(ellipses: Ellipses, grid: Grid, top: int, bottom: int) -> TileList:
     """As :func:`pointsplat_ns.rasterizer.ellipses.pairs_of`."""
-    counts = torch.zeros_like(ellipses.order)
-    gaussians, offsets, places = cast(tuple[Tensor, Tensor, Tensor], listed(ellipses, grid, top, bottom, counts))
-    return TileList(gaussians, offsets, places, counts, ellipses.order, top)
+    return cast(TileList, listed(ellipses, grid, top, bottom))
