@@ -31,7 +31,7 @@ from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, save_feedback_refiner
 from pointsplat_ns.system import processes
-from pointsplat_ns.system.threads import suitable_threads
+from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.view_source import VIEW_COUNTS
 from pointsplat_ns.views import View, Views
 
@@ -196,7 +196,7 @@ def train_feedback(
             steps = generator.choice(TRAINING.steps)
             own_generator = random.Random(generator.getrandbits(64))
             if number % size == rank:
-                with suitable_threads(scene.dense.device):
+                with one_thread_each():
                     (-roll_out(network, scene, budget, steps, own_generator) * (size / at_once)).backward()
         processes.average_gradients(network.parameters())
         if torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0).isfinite():

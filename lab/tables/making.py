@@ -9,7 +9,7 @@ import math
 import random
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -123,15 +123,15 @@ def fine_tuned(small: Gaussians, dense: Gaussians, scene: OpenedScene, steps: in
     """The recovery step of the baselines: steps of Adam on 0.8 L1 + 0.2 (1 - SSIM) against training photos, or renders
     of the dense scene where there are no photos. Each view comes once before any is repeated."""
 
-    def examples() -> Iterator[Example]:
+    def examples() -> Iterator[Callable[[], Example]]:
         (views, photos), order = (scene.training.views, scene.training.photos), random.Random(PROTOCOL.seed)
         with torch.no_grad():
             targets = photos or [render(dense, view) for view in views]
         while True:
             for index in reversed(order.sample(range(len(views)), len(views))):
-                yield Example(views[index], targets[index].to(small.means))
+                yield functools.partial(Example, views[index], targets[index].to(small.means))
 
-    scenes = optimised(small, Adam(small, AdamSettings(), RATES), examples(), pixel_loss="l1")
+    scenes = optimised(small, Adam(small, AdamSettings(), RATES), examples(), pixel_loss="l1", together=1)
     return next(itertools.islice(scenes, steps - 1, None))
 
 

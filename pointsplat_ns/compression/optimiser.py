@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Literal
 
 import torch
@@ -22,7 +23,7 @@ from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import one_thread, suitable_threads
+from pointsplat_ns.system.threads import in_turn, most_threads, one_thread, one_thread_each
 from pointsplat_ns.views import View
 
 RATES = {
@@ -38,6 +39,11 @@ RATES = {
 
 Choose = Callable[[Gaussians], tuple[float, Tensor | None]]
 """From the scene before a step to the arguments ``share`` and ``factors`` of :meth:`Adam.moves`."""
+
+TOGETHER = 2
+"""Views whose gradients are computed at once, on a thread each, of one scene; then a step follows for each. Held-out
+photos lose nothing by two (fox, vr_project), and a repair 0.01 to 0.05 dB (three splats at 3 to 50 %). With four, a
+repair loses up to 0.16 dB."""
 
 
 @dataclass(frozen=True)
@@ -161,9 +167,10 @@ class Adam:
 def optimised(
     scene: Gaussians,
     adam: Adam,
-    examples: Iterator[Example],
+    examples: Iterator[Callable[[], Example]],
     choose: Choose = lambda scene: (1.0, None),
     pixel_loss: PixelLoss = "rmse",
+    together: int = TOGETHER,
 ) -> Iterator[Gaussians]:
     """Yield the scene after each step, without end. Values that are not finite (the logit of opacity 1, the log-scale
     of a flat axis) do not change.
@@ -171,15 +178,24 @@ def optimised(
     Args:
         scene: K Gaussians; not changed.
         adam: its averages; made from the same scene.
-        examples: views and their target images, without end.
+        examples: functions that make a view and its target image, on any thread; without end.
         choose: the length of a step; called after its gradients are computed.
         pixel_loss: "l1" for the loss of 3DGS.
+        together: number of steps whose gradients are those of the scene before the first of them.
     """
-    scene = scene.detach()
+    last = scene.detach()
+
+    def gradients(example: Callable[[], Example]) -> dict[str, Tensor]:
+        return gradients_of(last, *example(), pixel_loss=pixel_loss)
+
     while True:
-        with suitable_threads(scene.device):
-            scene = adam.stepped(scene, gradients_of(scene, *next(examples), pixel_loss=pixel_loss), choose)
-        yield scene
+        with one_thread_each():
+            inside = max(1, most_threads() // together)
+            found = [*in_turn(gradients, [*islice(examples, together)], scene.device, inside)]
+        for each in found:
+            with one_thread_each():
+                scene = last = adam.stepped(last, each, choose)
+            yield last
 
 
 def extent(scene: Gaussians) -> float:

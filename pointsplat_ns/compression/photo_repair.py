@@ -13,6 +13,7 @@ A few times, Gaussians are split where the loss pulls at them most, and merging 
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 from collections.abc import Callable, Iterator
@@ -31,9 +32,8 @@ from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.looking.sampling import Sampler
-from pointsplat_ns.photos.examples import Example, Photos, every_kth_pixel, mean_psnr
+from pointsplat_ns.photos.examples import Example, Photos, every_kth_pixel, mean_psnr, render_of
 from pointsplat_ns.pruning import prune
-from pointsplat_ns.rasterizer import render
 from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from pointsplat_ns.views import Views, spread_indices
 
@@ -177,19 +177,18 @@ def _scenes(
         scene = reallocated(scene, pull, 0.2, views.for_merging())
 
 
-def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Example]:
-    """Photos, each once before any is repeated, and renders of the dense scene; without end."""
+def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSource) -> Iterator[Callable[[], Example]]:
+    """Photos, each once before any is repeated, and renders of the dense scene, each drawn once; without end."""
     generator = random.Random(0)
     sampled = islice(views.sampled(drawn_side=PHOTO_REPAIR.side), VIEW_COUNTS.stepped)
-    renders = cycle(Example(view, render(dense, view)) for view in sampled)  # which keeps them
+    renders = cycle(functools.cache(functools.partial(render_of, dense, view)) for view in sampled)
     shown = (index for _ in counted() for index in generator.sample(used, len(used)))
     for step in counted(1):
-        with torch.no_grad():
-            if step % PHOTO_REPAIR.dense_every:
-                example = every_kth_pixel(photos[next(shown)], PHOTO_REPAIR.side, dense.device, generator)
-            else:
-                example = next(renders)
-        yield example
+        if step % PHOTO_REPAIR.dense_every:
+            part = every_kth_pixel(photos[next(shown)], PHOTO_REPAIR.side, dense.device, generator)
+            yield lambda part=part: part
+        else:
+            yield next(renders)
 
 
 @torch.no_grad()

@@ -11,20 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from pointsplat_ns.comparing.sizes import SMALLEST_SIDE
 from pointsplat_ns.compression.feedback import REPAIR, Feedback
-from pointsplat_ns.compression.optimiser import optimised
+from pointsplat_ns.compression.optimiser import TOGETHER, optimised
 from pointsplat_ns.compression.requests import STEPS, Effort, RepairBudget
 from pointsplat_ns.compression.unfinished import Unfinished
 from pointsplat_ns.gaussians import Gaussians
-from pointsplat_ns.photos.examples import Example
-from pointsplat_ns.rasterizer import render
+from pointsplat_ns.photos.examples import Example, render_of
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, shipped_feedback_refiner
 from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
-from pointsplat_ns.views import View
 
 __all__ = ["STEPS", "Effort", "RepairBudget", "Repaired", "repair", "rate_factor", "initial_rate_factor"]
 
@@ -101,7 +98,8 @@ def repair(
 
     def kept(scenes: Iterator[Gaussians], first: int) -> Iterator[Gaussians]:
         for count, scene in enumerate(scenes, first + 1):
-            file.save(count, functools.partial(state_of, scene))
+            if count % TOGETHER == 0:
+                file.save(count, functools.partial(state_of, scene))
             yield scene
 
     examples = _examples(dense, views, budget.growth, run.count)
@@ -150,7 +148,7 @@ class OptimisationRun:
         return scene
 
 
-def _examples(dense: Gaussians, views: ViewSource, growth: float, taken: int = 0) -> Iterator[Example]:
+def _examples(dense: Gaussians, views: ViewSource, growth: float, taken: int = 0) -> Iterator[Callable[[], Example]]:
     """Views after those ``taken``, and renders of the dense scene in them, without end.
 
     For ``growth`` times the steps, there are so many times the sampled views and pixels: a large scene has more
@@ -159,13 +157,9 @@ def _examples(dense: Gaussians, views: ViewSource, growth: float, taken: int = 0
     """
     count, side = round(growth * VIEW_COUNTS.stepped), round(math.sqrt(growth) * SMALLEST_SIDE)
 
-    @functools.lru_cache(maxsize=round(256 / growth))  # 0.2 GB where pictures are 16 to 9
-    def drawn(view: View) -> Tensor:
-        with torch.no_grad():
-            return render(dense, view)
-
+    drawn = functools.lru_cache(maxsize=round(256 / growth))(render_of)  # 0.2 GB where pictures are 16 to 9
     others = itertools.islice(views.others(count=count, drawn_side=side), taken, None)
-    return (Example(view, drawn(view)) for view in others)
+    return (functools.partial(drawn, dense, view) for view in others)
 
 
 def rate_factor(done: float, last: float = REPAIR.last_factor) -> float:

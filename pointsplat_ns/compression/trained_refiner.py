@@ -22,7 +22,6 @@ from pointsplat_ns.io.splatfacto import allow_splatfacto_checkpoints
 from pointsplat_ns.pruning import PruneSettings, method_named
 from pointsplat_ns.refiner import Refiner, WeightsError, preset, read_metadata, read_refiner
 from pointsplat_ns.refiner.weights import SHIPPED_REFINER
-from pointsplat_ns.system.threads import suitable_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +46,7 @@ class TrainedRefiner:
         Raises:
             SceneError: if the SH degree exceeds the network's.
         """
-        with suitable_threads(self.device):
-            return self.network(scene.to(self.device)).to(scene.device)
+        return self.network(scene.to(self.device)).to(scene.device)
 
     @property
     def device(self) -> torch.device:

@@ -15,7 +15,6 @@ from pointsplat_ns.geometry.transforms import rotation_matrices
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import in_pieces
 from pointsplat_ns.system.tensors import DOUBLES
-from pointsplat_ns.system.threads import most_threads
 
 MIN_DIVISOR = 1e-300
 """Lower bound of float64 denominators, which keeps quotients finite; the smallest normal float64 is 2e-308."""
@@ -36,7 +35,7 @@ def covariances_of(scene: Gaussians, rows: Tensor, compiled: bool | None = None)
         return in_pieces(lambda some: covariances(scene.scales[some].double(), scene.quats[some].double()), rows, 6)
     cov, scales, quats = torch.empty(len(rows), 6, **DOUBLES), scene.scales.contiguous(), scene.quats.contiguous()
     task = KERNELS.structs["Shapes"](log_scales=scales, quats=quats, rows=rows.contiguous(), count=len(rows), cov=cov)
-    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task, threads=most_threads())
+    on_threads(len(rows) >= SEVERAL, KERNELS.library.pointsplat_covariances, task)
     return cov
 
 

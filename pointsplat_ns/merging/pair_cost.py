@@ -47,7 +47,7 @@ from pointsplat_ns.merging.state import State
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import pieces
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES, numbers
-from pointsplat_ns.system.threads import in_threads, most_threads
+from pointsplat_ns.system.threads import in_threads
 
 TINY = 1e-30
 """Lower bound of float32 denominators, which keeps quotients finite; the smallest normal float32 is 1e-38."""
@@ -197,5 +197,5 @@ def _by_kernels(state: State, near: Tensor, settings: MergeSettings) -> Tensor:
         near=near.contiguous(), costs=costs,
     )  # fmt: skip
     for function in (KERNELS.library.pointsplat_projected, KERNELS.library.pointsplat_pair_costs):
-        on_threads(count >= SEVERAL, function, task, threads=most_threads())
+        on_threads(count >= SEVERAL, function, task)
     return costs

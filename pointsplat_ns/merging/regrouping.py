@@ -38,7 +38,7 @@ from pointsplat_ns.merging.state import Participants, bounded_colours
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, on_threads
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES, add_rows, numbers
-from pointsplat_ns.system.threads import in_threads, in_turn, most_threads
+from pointsplat_ns.system.threads import in_threads, in_turn
 
 
 class Members:
@@ -203,7 +203,7 @@ def best_groups(
                 candidates=near.shape[1], group_means=groups.means, inverse=inverse, best=best,
                 log_determinants=log_determinants, group_colours=groups.colours, colour_weight=colour_weight,
             )  # fmt: skip
-            on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task, threads=most_threads())
+            on_threads(len(own) >= SEVERAL, KERNELS.library.pointsplat_best_groups, task)
             result[these] = best
             return
         candidates = torch.cat([own[:, None], near], dim=1)  # (m, 7)

@@ -29,7 +29,7 @@ from pointsplat_ns.nerfstudio_plugin.cameras import RasterizerOptions
 from pointsplat_ns.nerfstudio_plugin.frames import tensor_bytes
 from pointsplat_ns.system import processes
 from pointsplat_ns.system.memory import keep_freed_memory
-from pointsplat_ns.system.threads import fixed_threads, suitable_threads
+from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 
 STATE = "pointsplat"
 """Key in checkpoints of what a trainer needs to go on as if it had not been stopped; nerfstudio ignores it."""
@@ -139,7 +139,7 @@ class StoppableTrainer(Trainer):
         if self._asked is not None:
             self._between_steps = True
             raise KeyboardInterrupt
-        with suitable_threads(torch.device(self.device)):
+        with one_thread_each():
             buffers = [(buffer, buffer.clone()) for buffer in self.pipeline.model.buffers()]
             self.optimizers.zero_grad_all()
             _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)

@@ -49,6 +49,12 @@ def mean_psnr(scene: Gaussians, photos: Photos, indices: list[int]) -> float:
     return fmean(photo.psnr(render(scene, photo.view)) for photo in shown)
 
 
+@torch.no_grad()
+def render_of(scene: Gaussians, view: View) -> Example:
+    """A view, and what it shows of a scene."""
+    return Example(view, render(scene, view))
+
+
 def every_kth_pixel(photo: Example, side: int, device: torch.device, generator: random.Random | None = None) -> Example:
     """Every k-th pixel of a photo along each axis, and the view that draws exactly these pixels.
 

@@ -14,7 +14,7 @@ from pointsplat_ns.rasterizer import pictures
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN, QUALITIES
 from pointsplat_ns.rasterizer.projection import camera_to, drawn_antialiased
 from pointsplat_ns.rasterizer.rendering import Colors, QualityName, rasterization
-from pointsplat_ns.system.threads import one_thread, suitable_threads
+from pointsplat_ns.system.threads import one_thread_each
 from pointsplat_ns.views import View, Views
 
 
@@ -69,7 +69,7 @@ def render_with_alpha(
 ) -> tuple[Tensor, Tensor]:
     """Picture (H, W, 3) of one view and its alpha (H, W, 1), both in [0, 1]. Arguments and errors are those of
     :func:`render`."""
-    with suitable_threads(scene.device):
+    with one_thread_each():
         fixed = not (torch.is_grad_enabled() and (view.viewmat.requires_grad or view.background.requires_grad))
         if fixed and backend == "torch" and quality in QUALITIES and pictures.can_draw(scene, None):
             drawn = pictures.picture(scene, camera_to(scene, view), view.background, QUALITIES[quality])
@@ -86,13 +86,11 @@ def render_with_alpha(
 def _rasterized(scene: Gaussians, view: View, colors: Colors, **options) -> tuple[Tensor, Tensor]:
     """Image (H, W, channels) and alphas (H, W, 1) of a scene with these colours, and more of what
     :func:`~pointsplat_ns.rasterization` takes."""
-    with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
-        opacities = scene.alphas
     image, alpha, meta = rasterization(
         means=scene.means,
         quats=scene.quats,
         scales=scene.stds,
-        opacities=opacities,
+        opacities=scene.alphas,
         colors=colors,
         viewmats=view.viewmat[None],
         Ks=view.K[None],
@@ -118,7 +116,7 @@ def _warn_of(skipped: int, scene: Gaussians) -> None:
 def render_depth(scene: Gaussians, view: View) -> tuple[Tensor, Tensor]:
     """Expected depth (H, W) along the camera's z axis, scene units, and alpha (H, W) in [0, 1], of each pixel of a
     view. The images are rendered on the scene's device."""
-    with suitable_threads(scene.device):
+    with one_thread_each():
         colors = scene.means  # any: only depths are rendered
         depth, alpha = _rasterized(scene, view, colors, render_mode="ED")
     return depth[..., 0], alpha[..., 0]
@@ -129,7 +127,7 @@ def pixels_of(scene: Gaussians, view: View, compiled: bool | None = None) -> Ten
     weight, which is its alpha times the transmittance in front of it. It is the gradient of the sum of the picture by
     the colour, and 0 where the view does not show the Gaussian. ``compiled`` is that of
     :func:`pointsplat_ns.rasterization`."""
-    with suitable_threads(scene.device):
+    with one_thread_each():
         if pictures.can_draw(single := _at_least_single(scene), compiled):
             weights = pictures.weights(single, camera_to(scene, view), ALPHA_MIN)
             if weights is not None:
@@ -141,7 +139,7 @@ def pixel_sums(scene: Gaussians, view: View, maps: Tensor, compiled: bool | None
     """Sums (N, D) over the pixels of a view of the blending weight of each Gaussian times the values of D maps,
     (H, W, D): :func:`pixels_of` for a map of ones."""
     scene = _at_least_single(scene)
-    with suitable_threads(scene.device), torch.enable_grad():
+    with one_thread_each(), torch.enable_grad():
         colors = torch.zeros(len(scene), maps.shape[-1], dtype=scene.dtype, device=scene.device).requires_grad_()
         image, _ = _rasterized(scene, view, colors, compiled=compiled)
         (sums,) = torch.autograd.grad(image, colors, maps.to(image))

@@ -52,33 +52,6 @@ class OtherPrograms:
         return min(max(0.0, cores() - (limit - others)), float(cores()))
 
 
-class FreeCores:
-    """Number of cores that other programs leave to this process, by a look at the machine at most once a second.
-
-    What other programs use is rounded: half a core and more counts as one, because a program that never pauses gets two
-    thirds of a core where two threads of this process compete with it for two.
-    """
-
-    def __init__(self) -> None:
-        self._others: OtherPrograms | None = None
-        self._count = 1
-
-    def __call__(self) -> int:
-        """The number as the latest look found it, at least 1."""
-        if self._others is None:
-            self._others = OtherPrograms()
-            time.sleep(0.1)  # the system counts time in hundredths of a second
-        elif time.monotonic() - self._others.before[0] < 1.0:  # seconds; a look takes a millisecond
-            return self._count
-        self._count = max(1, cores() - round(self._others.cores()))
-        self._others = OtherPrograms()
-        return self._count
-
-
-free_cores = FreeCores()
-"""One for the process, so that looks are not repeated."""
-
-
 @functools.cache
 def cpu_quota(root: Path = Path("/")) -> float:
     """Number of cores that Linux's control groups (version 2) allow this process, the least of its group and all above;

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import torch
 
 from pointsplat_ns.system.native import IS_X86, cpp_files, library_path
+from pointsplat_ns.system.threads import most_threads
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -198,16 +199,16 @@ def _pool(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-kernel")
 
 
-def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object, threads: int | None = None) -> None:
-    """Call a function of a C++ file in ``threads`` threads, by default as many as torch uses, or in one if more are not
-    worth it.
+def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
+    """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads, or in one if more
+    are not worth it.
 
     The last parameter of the function points to the number of pieces of work that threads have taken. ctypes lets go of
     Python during the call.
     """
     taken = ctypes.c_int64(0)
     call = functools.partial(function, *arguments, ctypes.byref(taken))
-    threads = (threads or torch.get_num_threads()) if worth_it else 1
+    threads = most_threads() if worth_it else 1
     others: list[Future[object]] = []
     try:
         try:

@@ -10,6 +10,8 @@ from typing import Any, TypeVar, cast
 
 import torch
 
+from pointsplat_ns.system.threads import one_thread_each
+
 FLOATS: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 DOUBLES: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
 INDICES: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
@@ -38,12 +40,13 @@ def of_network() -> dict[str, Any]:
 
 
 def normal_mode(function: Function) -> Function:
-    """The function, run outside of inference mode even if it is called in it. Scenes and views among its arguments that
-    were made in inference mode are copied, because torch takes no gradients of such tensors."""
+    """The function, run with :func:`~pointsplat_ns.system.threads.one_thread_each`, and outside of inference mode even
+    if it is called in it. Scenes and views among its arguments that were made in inference mode are copied, because
+    torch takes no gradients of such tensors."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        with torch.inference_mode(False):
+        with torch.inference_mode(False), one_thread_each():
             return function(*map(_copied, args), **{name: _copied(value) for name, value in kwargs.items()})
 
     return cast(Function, run)

@@ -1,24 +1,27 @@
-"""Pieces of work on several threads, and how many threads torch uses.
+"""Work on several threads, each of which computes on one.
 
-Threads that share one operation wait for one another at its end. Where there are more of them than free cores, one is
-always late, and a step on two threads can take ten times as long as on one. :func:`suitable_threads` therefore uses as
-many as cores are free. Pieces of work (:func:`in_threads`) do not wait, and use all.
+Where torch shares an operation between threads, they wait for one another at its end, on their cores, and small
+operations end often: two threads take as long as one, and ten times as long where another program has one of the cores.
+Here torch uses one thread (:func:`one_thread_each`). Pieces of work (:func:`in_turn`), and kernels of this package
+(:func:`pointsplat_ns.system.kernels.on_threads`) use all, and sleep while they wait.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
 
 from pointsplat_ns.errors import PointSplatError
-from pointsplat_ns.system.cores import cores, free_cores
+from pointsplat_ns.system.cores import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,22 +30,23 @@ THREADS_VARIABLE = "OMP_NUM_THREADS"
 """Environment variable with the number of torch's threads. Where it is set, no other number is chosen."""
 
 
-class Chosen(threading.local):
-    """The choice of :func:`suitable_threads` in one thread of Python."""
+class Own(threading.local):
+    """What :func:`one_thread_each` found in one thread of Python."""
 
     most: int | None = None
-    """Number of threads that torch had before; None where nothing is chosen."""
-    fixed: bool = False
-    """Whether no other number may be chosen: within a step, or where work is in pieces."""
+    """Number of threads that torch had before; None outside."""
 
 
-chosen = Chosen()
+own = Own()
 
 
 def most_threads() -> int:
-    """Number of threads for pieces of work that do not wait for one another: as many as torch has, or had before fewer
-    were chosen."""
-    return torch.get_num_threads() if chosen.most is None else chosen.most
+    """Number of threads that share work here: as many as torch has, or had outside of :func:`one_thread_each`; no more
+    than there are cores, unless ``OMP_NUM_THREADS`` says so."""
+    if own.most is not None:
+        return own.most
+    threads = torch.get_num_threads()
+    return threads if threads == 1 or THREADS_VARIABLE in os.environ else min(threads, cores())
 
 
 @contextmanager
@@ -59,25 +63,33 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Let torch use one thread while the context is open, and :func:`in_threads` as many as torch had: for long work
-    whose result must not depend on the number of threads. Nothing is chosen in it."""
-    before, outer = torch.get_num_threads(), (chosen.most, chosen.fixed)
-    chosen.most, chosen.fixed = most_threads(), True
-    torch.set_num_threads(1)
+    """Let torch use one thread while the context is open, and pieces of work and kernels :func:`most_threads`. The
+    result does not depend on their number."""
+    outer, own.most = own.most, most_threads()
     try:
-        yield
+        with one_thread():
+            yield
     finally:
-        torch.set_num_threads(before)
-        chosen.most, chosen.fixed = outer
+        own.most = outer
 
 
-def in_turn(function: Callable[[Item], Result], items: Sequence[Item], device: torch.device) -> Iterator[Result]:
+@functools.cache
+def _pool(process: int, count: int, inside: int) -> ThreadPoolExecutor:
+    """Threads of a process, torch using ``inside`` in each: those of one that forked are not the other's. New threads
+    for each use would take a fifth of a small step."""
+    return ThreadPoolExecutor(count, "pointsplat", torch.set_num_threads, (inside,))
+
+
+def in_turn(
+    function: Callable[[Item], Result], items: Sequence[Item], device: torch.device, inside: int = 1
+) -> Iterator[Result]:
     """The results of a function of each item, in their order: computed on a CPU on :func:`most_threads` threads, torch
-    using one inside each; for a GPU in this thread, as a GPU runs one operation of a process after the other, and not
-    all of torch may be called there from several threads.
+    and kernels using ``inside`` in each; for a GPU in this thread, as a GPU runs one operation of a process after the
+    other, and not all of torch may be called there from several threads.
 
     One operation on a small piece that stays in the cache is faster on one thread than shared between several, which
-    wait for one another. Calls must not depend on each other. torch takes gradients in them if it does here.
+    wait for one another. Calls must not depend on each other. torch takes gradients in them if it does here. No call
+    runs any more when this ends, by an error or Ctrl-C, too.
     """
     count = min(most_threads(), len(items)) if device.type == "cpu" else 1
     if count <= 1:
@@ -89,8 +101,17 @@ def in_turn(function: Callable[[Item], Result], items: Sequence[Item], device: t
         with torch.inference_mode(inference), torch.set_grad_enabled(grad):
             return function(item)
 
-    with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        yield from pool.map(call, items)
+    pool = _pool(os.getpid(), count, inside)
+    futures = deque(pool.submit(call, item) for item in items)
+    try:
+        while futures:
+            result = futures[0].result()
+            futures.popleft()
+            yield result
+    finally:
+        for future in futures:
+            future.cancel()
+        wait(futures)
 
 
 def in_threads(function: Callable[[Item], object], items: Sequence[Item], device: torch.device) -> None:
@@ -120,30 +141,6 @@ def fixed_threads(count: int | None) -> Iterator[None]:
             os.environ.pop(THREADS_VARIABLE, None)
         else:
             os.environ[THREADS_VARIABLE] = variable
-
-
-@contextmanager
-def suitable_threads(device: torch.device | None = None) -> Iterator[None]:
-    """Let torch use at most as many threads while the context is open as other programs leave cores to this process,
-    and at least one.
-
-    Nothing is chosen for a GPU, where ``OMP_NUM_THREADS`` is set, nor within another such context. A result must not
-    depend on the choice, which depends on the load: use it for work that gives the same bits on any number of threads,
-    or for which a tolerance is stated. A ``device`` of None is the CPU.
-    """
-    before, outer = torch.get_num_threads(), chosen.most
-    on_cpu = device is None or device.type == "cpu"
-    if not on_cpu or chosen.fixed or most_threads() <= 1 or THREADS_VARIABLE in os.environ:
-        yield
-        return
-    chosen.most = min(most_threads(), cores())
-    chosen.fixed = True
-    try:
-        torch.set_num_threads(min(chosen.most, free_cores()) if chosen.most > 1 else 1)
-        yield
-    finally:
-        torch.set_num_threads(before)
-        chosen.most, chosen.fixed = outer, False
 
 
 def now(device: torch.device) -> float:
