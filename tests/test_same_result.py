@@ -1,14 +1,14 @@
-"""The same again, on one thread and on two: the same selection and the same bytes.
-
-Without compiled kernels, two threads add up gradients in another order than one.
-"""
+"""The same again, on one thread and on several: the same selection, the same repair and the same bytes."""
 
 import pytest
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
+from pointsplat_ns.compression.repair import RepairBudget, repair
 from pointsplat_ns.pruning.methods import METHODS
+from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
+from pointsplat_ns.view_source import ViewSource
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,15 @@ def test_a_scene_is_made_small_to_the_same_bits_on_one_thread_and_on_two(by, roo
     assert same_bits(first, ps.prune(room, 0.3, by=by, views=views))
     with fixed_threads(2):
         assert same_bits(first, ps.prune(room, 0.3, by=by, views=views))
+
+
+@pytest.mark.skipif(bool(KERNELS.why_missing), reason="without kernels, threads add up gradients in another order")
+def test_a_repair_has_the_same_bits_on_any_number_of_threads(room):
+    small, source, found = ps.prune(room, 0.3), ViewSource(room, given=ps.sample_views(room, 24, 64, 48)), []
+    for count in (1, 2, 3):
+        with fixed_threads(count):
+            found.append(repair(small, room, source, RepairBudget("quick")).scene)
+    assert not same_bits(small, found[0]) and all(same_bits(found[0], each) for each in found[1:])
 
 
 @pytest.mark.parametrize("suffix", ("ply", "spz", "sog", "splat"))

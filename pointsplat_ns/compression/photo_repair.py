@@ -157,7 +157,7 @@ def photo_repair(
 
 
 def _scenes(
-    scene: Gaussians, examples: Iterator[Example], views: ViewSource, run: OptimisationRun
+    scene: Gaussians, examples: Iterator[Callable[[], Example]], views: ViewSource, run: OptimisationRun
 ) -> Iterator[Gaussians]:
     """The scene after each step of a run, without end."""
     rates = {**RATES, "means": PHOTO_REPAIR.means_rate}
@@ -186,7 +186,7 @@ def _examples(photos: Photos, used: list[int], dense: Gaussians, views: ViewSour
     for step in counted(1):
         if step % PHOTO_REPAIR.dense_every:
             part = every_kth_pixel(photos[next(shown)], PHOTO_REPAIR.side, dense.device, generator)
-            yield lambda part=part: part
+            yield functools.partial(Example, *part)
         else:
             yield next(renders)
 

@@ -24,7 +24,6 @@ from pointsplat_ns.rasterizer.quadratics import PIXELS
 from pointsplat_ns.rasterizer.spherical_harmonics import zeros_like
 from pointsplat_ns.system.kernels import KERNELS, SEVERAL, Struct, on_threads
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
-from pointsplat_ns.system.threads import one_thread
 
 MOST_PAIRS = MEMORY_BUDGET // 16
 """Largest number of pairs of Gaussian and tile in one pass, of 12 bytes each; pictures of more are drawn by regions."""
@@ -46,8 +45,7 @@ def _placed(scene: Gaussians, camera: Camera, colored: bool, alpha_min: float, t
     """What a camera sees, with or without colours, with all that gradients need if it is ``taped``; None if the pairs
     are more than :data:`MOST_PAIRS`, or than gradients of 192 bytes each have memory for."""
     library, count = KERNELS.library, len(scene)
-    with one_thread():  # where the shares of threads end, torch rounds a sigmoid in another way
-        tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
+    tensors = [value.contiguous() for value in (scene.means, scene.quats, scene.stds, scene.alphas)]
     coefficients = scene.features_dc.contiguous(), scene.features_rest.contiguous()
     channels, grid = (3 if colored else 0), Grid(camera.lens.width, camera.lens.height, alpha_min)
     ranges = -(-count // library.pointsplat_range())

@@ -28,7 +28,7 @@ from pointsplat_ns.pruning import need_usable, ply_bytes
 from pointsplat_ns.rasterizer import render
 from pointsplat_ns.system.cores import OtherPrograms, cores
 from pointsplat_ns.system.progress import Progress
-from pointsplat_ns.system.threads import fixed_threads, now
+from pointsplat_ns.system.threads import most_threads, now
 from pointsplat_ns.tradeoff.making import Subject
 from pointsplat_ns.tradeoff.points import DENSE, ImageMetrics, Point, Setting, Speed
 from pointsplat_ns.view_source import VIEW_COUNTS
@@ -149,11 +149,10 @@ class Measurer:
     def _speed(self, scene: Gaussians, show: Progress) -> tuple[Speed, float | None]:
         """The measured ratio of frames, and the cores that other programs used meanwhile."""
         others, pairs, views = OtherPrograms(), [], self.judged.views
-        with fixed_threads(torch.get_num_threads()):  # the same number for all frames
-            for _ in range(ROUNDS):
-                for view in views:
-                    pairs.append((_timed(self.dense, view), _timed(scene, view)))
-                    show("timing frames", len(pairs) / (ROUNDS * len(views)))
+        for _ in range(ROUNDS):
+            for view in views:
+                pairs.append((_timed(self.dense, view), _timed(scene, view)))
+                show("timing frames", len(pairs) / (ROUNDS * len(views)))
         rounds = np.array(pairs).reshape(ROUNDS, len(views), 2)  # seconds
         if self._dense_ms is None:
             self._dense_ms = 1000 * float(np.median(rounds[..., 0].min(axis=0)))
@@ -171,7 +170,7 @@ def _timed(scene: Gaussians, view: View) -> float:
 
 def machine_text(device: torch.device) -> str:
     """Processor, number of threads, device and version of torch, as text."""
-    threads, about = torch.get_num_threads(), Path("/proc/cpuinfo")  # of Linux
+    threads, about = most_threads(), Path("/proc/cpuinfo")  # of Linux
     models = re.findall(r"^model name\s*: *(.*)", about.read_text("utf-8", "replace"), re.M) if about.exists() else []
     processor = next(iter(models), "") or platform.processor() or platform.machine()
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
@@ -182,7 +181,7 @@ def busy_note(others: Sequence[float | None]) -> str:
     """A line of text if other programs disturbed measurements, from the cores that they used during each, which are
     None where nothing was timed; else empty. A quarter of a core does not change medians."""
     timed = [used for used in others if used is not None]
-    disturbed = [used for used in timed if used + torch.get_num_threads() > cores() + 0.25]
+    disturbed = [used for used in timed if used + most_threads() > cores() + 0.25]
     if not disturbed:
         return ""
     return (

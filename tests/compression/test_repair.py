@@ -1,5 +1,6 @@
 """Repair by optimisation: what it gains, what it sees, how long it takes, and how it ends."""
 
+import functools
 import itertools
 import math
 import sys
@@ -20,8 +21,10 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import changed
 from pointsplat_ns.metrics import SSIM_WINDOW
 from pointsplat_ns.metrics.structural_similarity import mean_ssim
+from pointsplat_ns.photos.examples import Example
 from pointsplat_ns.pruning import prune
 from pointsplat_ns.rasterizer import render
+from pointsplat_ns.system.threads import fixed_threads
 from pointsplat_ns.view_source import VIEW_COUNTS, ViewSource
 from quick_looking import USUAL
 
@@ -117,7 +120,7 @@ def test_a_killed_repair_continues_to_the_same_bits(hollow_ball, pruned, tmp_pat
 
     whole, _ = repaired()
     file.unlink()
-    assert repaired(0.3)[0] is None and repaired(0.6)[1][0] == 11 / 32
+    assert repaired(0.32)[0] is None and repaired(0.64)[1][0] == 11 / 32  # killed after 11 and 21
     rest, done = repaired()
     assert same(rest, whole) and done[0] == 21 / 32
     assert len(repaired(start=pruned.replace(means=pruned.means + 0.1))[1]) == 32, "another scene starts anew"
@@ -174,11 +177,27 @@ def test_gradients_that_are_not_finite_and_values_that_are_not_stay_out(pruned, 
 
     monkeypatch.setattr("pointsplat_ns.compression.optimiser.render", spoiled)
     example = ball_views[0], torch.zeros(48, 64, 3, dtype=dtype)
-    after = next(optimised(scene, Adam(scene, AdamSettings()), itertools.repeat(example)))
+    after = next(optimised(scene, Adam(scene, AdamSettings()), itertools.repeat(lambda: example)))
     assert after.opacities[0] == math.inf and after.scales[1, 2] == -math.inf
     assert bool(after.usable().all()) and after.dtype == dtype
     assert torch.equal(after.means[2], scene.means[2]), "a NaN gradient moves nothing"
     assert not torch.equal(after.features_dc, scene.features_dc)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("together", [1, 2, 3])
+def test_steps_take_gradients_of_one_scene_together(pruned, ball_views, together, threads):
+    examples = [Example(view, torch.full((48, 64, 3), 0.1 * i)) for i, view in enumerate(ball_views[:6])]
+    adam, scene, wanted = Adam(pruned, AdamSettings()), pruned, []
+    for first in range(0, 6, together):
+        gradients = [gradients_of(scene, *example) for example in examples[first : first + together]]
+        for each in gradients:
+            scene = adam.stepped(scene, each, lambda scene: (1.0, None))
+            wanted.append(scene)
+    makers = (functools.partial(Example, *example) for example in examples)
+    with fixed_threads(threads):
+        found = optimised(pruned, Adam(pruned, AdamSettings()), makers, together=together)
+        assert all(same(next(found), each) for each in wanted)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-20, 1.0, 1e18])

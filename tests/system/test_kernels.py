@@ -83,8 +83,8 @@ def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():
         time.sleep(0.2)
         ended.append(threading.get_ident())
 
-    with pytest.raises(KeyboardInterrupt):
-        kernels.on_threads(True, function, threads=3)
+    with fixed_threads(3), pytest.raises(KeyboardInterrupt):
+        kernels.on_threads(True, function)
     assert len(ended) == 2
 
 
@@ -92,10 +92,14 @@ def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeyp
     pool, called = ThreadPoolExecutor(1), []
     pool.shutdown()
     monkeypatch.setattr(kernels, "_pool", lambda process: pool)
-    kernels.on_threads(True, lambda _: called.append(threading.get_ident()), threads=3)
-    assert called == [threading.get_ident()]
-    with ThreadPoolExecutor(1) as other, pytest.raises(SystemExit):
-        other.submit(kernels.on_threads, True, lambda _: called.append(None), threads=3).result()
+    with fixed_threads(3):
+        kernels.on_threads(True, lambda _: called.append(threading.get_ident()))
+        assert called == [threading.get_ident()]
+        with (
+            ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(3,)) as other,
+            pytest.raises(SystemExit),
+        ):
+            other.submit(kernels.on_threads, True, lambda _: called.append(None)).result()
     assert called == [threading.get_ident()]
 
 

@@ -213,7 +213,7 @@ def test_the_dense_scene_comes_with_the_next_best_and_its_cost(photos, loss):
 
 def test_a_machine_is_busy_when_too_few_cores_are_left(monkeypatch):
     monkeypatch.setattr(measuring, "cores", lambda: 4)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(measuring, "most_threads", lambda: 2)
     assert [bool(measuring.busy_note([others])) for others in (0.0, 2.0, 2.3, 4.0)] == [False, False, True, True]
     assert measuring.busy_note([None, 2.0]) == ""
     assert "while 1 of 2 points were timed, other programs took up to 3.0 of 4" in measuring.busy_note([None, 2.0, 3.0])
