@@ -4,7 +4,7 @@ import pytest
 
 import pointsplat_ns as ps
 from making import box_room, same_bits
-from pointsplat_ns.compression.repair import RepairBudget, repair
+from pointsplat_ns.compression.repair import STEPS, RepairBudget, repair
 from pointsplat_ns.pruning.methods import METHODS
 from pointsplat_ns.system.kernels import KERNELS
 from pointsplat_ns.system.threads import fixed_threads
@@ -31,7 +31,8 @@ def test_a_scene_is_made_small_to_the_same_bits_on_one_thread_and_on_two(by, roo
 
 
 @pytest.mark.skipif(bool(KERNELS.why_missing), reason="without kernels, threads add up gradients in another order")
-def test_a_repair_has_the_same_bits_on_any_number_of_threads(room):
+def test_a_repair_has_the_same_bits_on_any_number_of_threads(room, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 8)
     small, source, found = ps.prune(room, 0.3), ViewSource(room, given=ps.sample_views(room, 24, 64, 48)), []
     for count in (1, 2, 3):
         with fixed_threads(count):
