@@ -48,7 +48,7 @@ def test_photos_of_any_lens_are_those_of_a_pinhole(kind, lens, tmp_path):
         capture.write_colmap(tmp_path / "sparse" / "0", capture.write_photos(tmp_path / "images"))
         named = read_named_views(tmp_path)
     else:
-        named = read_named_views(capture.write_nerfstudio(tmp_path) / "transforms.json")
+        named = read_named_views(capture.write_nerfstudio(tmp_path))
     folder = tmp_path / "images"
     files = photos_of_cameras(folder, photo_files(folder), named)
     reader = PhotoReader(tmp_path, 1000)

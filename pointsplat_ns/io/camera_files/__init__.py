@@ -101,7 +101,8 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
     see the same field of view, by other focal lengths.
 
     Args:
-        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json``, or the folder of a COLMAP model or project.
+        path: INRIA's ``cameras.json``, nerfstudio's ``transforms.json`` or its folder, or the folder of a COLMAP model
+            or project.
         transforms: the ``dataparser_transforms.json`` of the run that the scene is from: it moves poses of
             ``transforms.json`` and of COLMAP into the frame of the scene. By default the one beside ``path``, if there
             is one. Poses of ``cameras.json`` are in the scene's frame already.
@@ -123,6 +124,8 @@ def read_named_views(path: Path | str, transforms: Path | None = None) -> NamedV
     """
     path = Path(path)
     model = model_folder(path)
+    if model is None and (path / "transforms.json").is_file():
+        path /= "transforms.json"
     found = _json_cameras(path) if model is None else colmap_cameras(path)
     if bent := sum(camera.bent for camera in found.cameras):
         logger.info("%s: the lens distortion of %d of %d cameras is ignored", path, bent, len(found.cameras))
