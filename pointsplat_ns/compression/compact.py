@@ -40,7 +40,8 @@ def compact_scene(
     """Make a scene smaller, refine it if there is a refiner, and repair it for the budget of the request. Scenes of the
     result are on the device of ``dense``. By default views are sampled. With ``photos``, and a budget for
     it, the scene is trained on them, and repaired only where that harms: a repair before brings nothing (a tenth of
-    fox, figure, ray and vr_project: within 0.1 dB in held-out photos, and within 0.2 dB in sampled views).
+    fox, figure, ray and vr_project: within 0.1 dB in held-out photos, and within 0.2 dB in sampled views), unless the
+    scene is large.
 
     Refinement and repair are accepted by comparing renders with those of the dense scene
     (:mod:`~pointsplat_ns.compression.acceptance`). A requested PSNR (``auto``) is reached before refinement, so that it
@@ -68,16 +69,20 @@ def compact_scene(
     stages = [Stage("merge" if request.prune.method.score is None else "prune", pruned.scene, before)]
     if request.refiner is not None:
         stages.append(_refined(stages[0], request.refiner, judge, uncompared, progress))
-    trained, left = None, last_kept(stages)
-    if photos is not None and request.photos is not None and not request.photos.empty:
+    left = last_kept(stages)
+    comparable = left.after is not None and left.after.psnr < math.inf and not request.repair.empty
+    repairing, budget = judge if comparable else None, request.photos
+    training = None if budget is None or budget.empty else photos
+    if repairing is not None and (training is None or len(left.scene) > PHOTO_REPAIR.large):
+        stages.append(_repaired(left, at_work, request, repairing, views, progress))
+        repairing = None
+    if training is not None and budget is not None and not stages[-1].interrupted:
         progress("training on photos", 0.0)
-        report = functools.partial(progress, "training on photos")
-        trained = photo_repair(left.scene.to(at_work.device), at_work, photos, views, request.photos, report)
-    if judge is not None and left.after is not None and left.after.psnr < math.inf and not request.repair.empty:
-        if trained is None or (trained.why_not() and not trained.interrupted):
-            stages.append(_repaired(left, at_work, request, judge, views, progress))
-    if trained is not None and photos is not None:
-        stages.append(_trained(stages, trained, photos, reference))
+        report, scene = functools.partial(progress, "training on photos"), last_kept(stages).scene.to(at_work.device)
+        trained = photo_repair(scene, at_work, training, views, budget, report)
+        if repairing is not None and trained.why_not() and not trained.interrupted:
+            stages.append(_repaired(left, at_work, request, repairing, views, progress))
+        stages.append(_trained(stages, trained, training, reference))
     interrupted = any(stage.interrupted for stage in stages)
     if pruned.limit is not None:
         stages += rounding_stage(last_kept(stages), pruned.limit, reference)

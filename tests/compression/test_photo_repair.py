@@ -11,6 +11,7 @@ import pointsplat_ns as ps
 from making import FewViews, views_from_within
 from pointsplat_ns.compression import compact as compacting
 from pointsplat_ns.compression import photo_repair as module
+from pointsplat_ns.compression import requests
 from pointsplat_ns.compression.compact import compact_scene, compact_to_psnr
 from pointsplat_ns.compression.optimiser import RATES, Adam, AdamSettings, Example, extent, gradients_of, size_factors
 from pointsplat_ns.compression.photo_repair import photo_repair, reallocated, split
@@ -94,6 +95,25 @@ def test_a_scene_is_kept_that_gains_in_its_photos_and_harms_no_others(
     assert (result.scene is stage.scene) == kept
     assert stage.photos is not None
     assert stage.photos.before == stage.photos.beside(result.stages[-2].scene, photos).before
+
+
+@pytest.mark.parametrize(("large", "side", "stages"), [(299, 320, ["repair", "photos"]), (300, 160, ["photos"])])
+def test_a_large_scene_is_repaired_first_and_more_pixels_are_drawn(
+    large, side, stages, hollow_ball, photos, monkeypatch
+):
+    settings, sides = dataclasses.replace(module.PHOTO_REPAIR, large=large), set()
+    for place in (module, compacting):
+        monkeypatch.setattr(place, "PHOTO_REPAIR", settings)
+    monkeypatch.setattr(
+        module, "every_kth_pixel", lambda photo, side, *rest: sides.add(side) or every_kth_pixel(photo, side, *rest)
+    )
+    monkeypatch.setattr(requests, "FEW", 75)
+    request = CompactRequest(PruneRequest(300), repair=RepairBudget("quick"), photos=PhotoBudget("quick"))
+    result = compact_scene(hollow_ball, request, FewViews(hollow_ball), photos=photos)
+    last = result.stages[-1]
+    assert [stage.name for stage in result.stages[1:]] == stages and last.accepted and sides == {side}
+    assert last.photos is not None
+    assert last.photos.before == mean_psnr(result.stages[-2].scene, photos, module._roles(len(photos))[1])
 
 
 def test_auto_finds_the_smallest_file_that_loses_little_in_held_out_photos(hollow_ball, photos):
