@@ -200,7 +200,7 @@ SCENES = f"""No constant is chosen on [judged scenes](../benchmarks.md#scenes). 
 rules, whose constants come from scenes for tuning: repairs hold from nearer places (rock, taebak), merging before a
 white background (ethiopianHead), and sampled views show little blur (apt_kitchen_balcony).
 The network of `compact` was trained on {", ".join(LEARNED)}.
-Rows of captures and of taebak are older: of other sampled views, and of repairs of 48 steps."""
+Rows of captures are older: of other sampled views, and of repairs of 48 steps."""
 
 UNLEARNED = "The gain of `compact` over `prune` in dB without the scenes of its training, in brackets with them."
 
