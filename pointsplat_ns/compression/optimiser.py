@@ -194,7 +194,7 @@ def optimised(
             found = [*in_turn(gradients, [*islice(examples, together)], scene.device, inside)]
         for each in found:
             with one_thread_each():
-                scene = last = adam.stepped(last, each, choose)
+                last = adam.stepped(last, each, choose)
             yield last
 
 

@@ -14,11 +14,9 @@ from contextlib import contextmanager
 from multiprocessing import connection, get_context, util
 from typing import Any, Generic, TypeVar
 
-import torch
-
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.system.cores import cores
-from pointsplat_ns.system.threads import THREADS_VARIABLE, fixed_threads
+from pointsplat_ns.system.threads import THREADS_VARIABLE, fixed_threads, most_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -120,7 +118,7 @@ def _started_safely(jobs: int) -> Iterator[None]:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    threads = torch.get_num_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
+    threads = most_threads() if THREADS_VARIABLE in os.environ else max(1, cores() // jobs)
     with _starting, fixed_threads(threads):
         helpers: Any = util
         start = helpers.spawnv_passfds

@@ -9,6 +9,7 @@ import torch
 from killing import where
 from pointsplat_ns.errors import DataError, PointSplatError
 from pointsplat_ns.system.cores import cores
+from pointsplat_ns.system.threads import fixed_threads, one_thread_each
 from pointsplat_ns.system.workers import Workers, check_jobs
 
 
@@ -23,6 +24,11 @@ def test_processes_share_the_cores_pass_errors_on_and_end_with_the_context(monke
     assert torch.get_num_threads() == before and "OMP_NUM_THREADS" not in os.environ
     assert os.getpid() not in {pid for pid, _ in found.values()}
     assert not any(psutil.pid_exists(pid) for pid, _ in found.values())
+
+
+def test_processes_have_the_users_number_of_threads_where_torch_has_one_here():
+    with fixed_threads(2), one_thread_each(), Workers(where, 2) as workers:
+        assert {threads for _, (_, threads) in workers.results([0.1, 0.2])} == {2}
 
 
 def test_a_process_that_is_killed_ends_the_work_with_one_error():
