@@ -67,7 +67,7 @@ class PhotoSettings:
     large: int = 40_000
     """Number of Gaussians above which a scene is repaired before it is trained, and steps draw more pixels: as a repair
     does for so many. 160 pixels show too little of it at once, and what one step gains elsewhere is lost. In held-out
-    photos, without and with both: 53,574 of a plant 23.3 and 23.7 dB, 84,307 of a garden, whose photos are renders,
+    photos, without and with both: 53,574 of a plant 23.3 and 23.5 dB, 84,307 of a garden, whose photos are renders,
     22.4 and 22.9."""
     moves: int = 5
     """Number of times that Gaussians are moved (:func:`reallocated`) to where the gradients
