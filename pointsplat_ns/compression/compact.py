@@ -82,7 +82,9 @@ def compact_scene(
         trained = photo_repair(scene, at_work, training, views, budget, report)
         if repairing is not None and trained.why_not() and not trained.interrupted:
             stages.append(_repaired(left, at_work, request, repairing, views, progress))
-        stages.append(_trained(stages, trained, training, reference))
+            if stages[-1].accepted:
+                trained = trained.beside(stages[-1].scene.to(at_work.device), training)
+        stages.append(_trained(last_kept(stages), trained, reference))
     interrupted = any(stage.interrupted for stage in stages)
     if pruned.limit is not None:
         stages += rounding_stage(last_kept(stages), pruned.limit, reference)
@@ -120,12 +122,9 @@ def _repaired(
     return Stage("repair", scene, after, last.after, reason, *figures)
 
 
-def _trained(stages: list[Stage], trained: PhotoRepaired, photos: Photos, reference: DenseReference | None) -> Stage:
-    """The scene that was trained on photos, compared with the last stage that was kept."""
-    last, device = last_kept(stages), trained.scene.device
-    most_lost = 0.0
-    if last.name == "repair":
-        trained, most_lost = trained.beside(last.scene.to(device), photos), PHOTO_REPAIR.most_lost
+def _trained(last: Stage, trained: PhotoRepaired, reference: DenseReference | None) -> Stage:
+    """The scene that was trained on photos, and compared in them with the last stage that was kept."""
+    most_lost = PHOTO_REPAIR.most_lost if last.name == "repair" else 0.0
     after = None if reference is None else reference.closeness(trained.scene)
     scene, figures = trained.scene.to(last.scene.device), (trained.steps, trained.seconds, trained.interrupted)
     return Stage("photos", scene, after, last.after, trained.why_not(most_lost), *figures, photos=trained)

@@ -16,14 +16,14 @@ import re
 import threading
 import warnings
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 
 from pointsplat_ns.system.native import IS_X86, cpp_files, library_path
-from pointsplat_ns.system.threads import most_threads
+from pointsplat_ns.system.threads import most_threads, pool
 
 logger = logging.getLogger("pointsplat_ns")
 
@@ -193,12 +193,6 @@ class Kernels:
 KERNELS = Kernels(library_path())
 
 
-@functools.cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Threads of a process: those of one that forked are not the other's."""
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="pointsplat-kernel")
-
-
 def on_threads(worth_it: bool, function: Callable[..., object], *arguments: object) -> None:
     """Call a function of a C++ file in :func:`~pointsplat_ns.system.threads.most_threads` threads, or in one if more
     are not worth it.
@@ -213,7 +207,7 @@ def on_threads(worth_it: bool, function: Callable[..., object], *arguments: obje
     try:
         try:
             for _ in range(threads - 1):
-                others.append(_pool(os.getpid()).submit(call))
+                others.append(pool("kernel", os.cpu_count() or 1).submit(call))
         except RuntimeError as error:  # no more threads are started: this one does the rest
             ending = "shutdown" in str(error)  # else the system has a limit
             if ending and threading.current_thread() is not threading.main_thread():

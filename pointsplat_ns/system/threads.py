@@ -27,7 +27,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 THREADS_VARIABLE = "OMP_NUM_THREADS"
-"""Environment variable with the number of torch's threads. Where it is set, no other number is chosen."""
+"""Environment variable with the number of torch's threads. Where it is set, more are used than there are cores."""
 
 
 class Own(threading.local):
@@ -73,11 +73,16 @@ def one_thread_each() -> Iterator[None]:
         own.most = outer
 
 
+def pool(name: str, count: int, inside: int = 1) -> ThreadPoolExecutor:
+    """Threads for one kind of work, torch using ``inside`` in each. New threads for each use would take a fifth of a
+    small step."""
+    return _pool(os.getpid(), name, count, inside)
+
+
 @functools.cache
-def _pool(process: int, count: int, inside: int) -> ThreadPoolExecutor:
-    """Threads of a process, torch using ``inside`` in each: those of one that forked are not the other's. New threads
-    for each use would take a fifth of a small step."""
-    return ThreadPoolExecutor(count, "pointsplat", torch.set_num_threads, (inside,))
+def _pool(process: int, name: str, count: int, inside: int) -> ThreadPoolExecutor:
+    """Threads of a process: those of one that forked are not the other's."""
+    return ThreadPoolExecutor(count, f"pointsplat-{name}", torch.set_num_threads, (inside,))
 
 
 def in_turn(
@@ -101,8 +106,8 @@ def in_turn(
         with torch.inference_mode(inference), torch.set_grad_enabled(grad):
             return function(item)
 
-    pool = _pool(os.getpid(), count, inside)
-    futures = deque(pool.submit(call, item) for item in items)
+    threads = pool("pieces", count, inside)
+    futures = deque(threads.submit(call, item) for item in items)
     try:
         while futures:
             result = futures[0].result()
@@ -122,8 +127,8 @@ def in_threads(function: Callable[[Item], object], items: Sequence[Item], device
 
 @contextmanager
 def fixed_threads(count: int | None) -> Iterator[None]:
-    """Let torch use so many threads while the context is open, here and in programs that are started, whatever would be
-    chosen; None changes nothing. Raises PointSplatError if the number is below 1, or above 1024: the system does not
+    """Let torch use so many threads while the context is open, here and in programs that are started; None
+    changes nothing. Raises PointSplatError if the number is below 1, or above 1024: the system does not
     start any number of threads, and torch ends the program then."""
     if count is None:
         yield

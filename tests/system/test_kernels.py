@@ -91,7 +91,7 @@ def test_ctrl_c_waits_for_threads_that_use_the_memory_of_the_call():
 def test_a_program_that_is_ending_calls_kernels_in_its_main_thread_alone(monkeypatch):
     pool, called = ThreadPoolExecutor(1), []
     pool.shutdown()
-    monkeypatch.setattr(kernels, "_pool", lambda process: pool)
+    monkeypatch.setattr(kernels, "pool", lambda name, count: pool)
     with fixed_threads(3):
         kernels.on_threads(True, lambda _: called.append(threading.get_ident()))
         assert called == [threading.get_ident()]

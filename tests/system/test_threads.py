@@ -3,7 +3,6 @@
 import threading
 import time
 
-import psutil
 import pytest
 import torch
 
@@ -90,4 +89,4 @@ def test_a_real_look_sees_what_others_leave():
         pass
     (start, own, limit, used), (now, own_after, _, used_after) = others.before, cores_module._usage()
     assert limit >= cores() and used_after - used > 0.2 and now > start and own_after > own
-    assert 0 <= others.cores() <= cores() and psutil.cpu_times(percpu=True)
+    assert 0 <= others.cores() <= cores()
