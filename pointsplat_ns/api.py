@@ -223,6 +223,7 @@ def lod(
     levels: Sequence[Keep | str] | str = ("50%", "25%", "10%", "3%"),
     *,
     sh: str = "all",
+    effort: Effort = "instant",
     views: Views | str | Path | None = None,
     resolution: tuple[int, int] | str | None = None,
     up: str | None = None,
@@ -243,6 +244,7 @@ def lod(
         scene: N Gaussians, or the path of a PLY, a checkpoint, or a Splatfacto run.
         levels: sizes of the levels, as ``keep`` of :func:`prune` except "auto"; in any order.
         sh: SH bands of every level, as for :func:`prune`.
+        effort: length of a repair of each level, as for :func:`compact`; its Gaussians keep their parents.
         views: cameras to compare renders in, as for :func:`prune`; at most 12 are used.
         resolution, up, data, progress: as for :func:`prune`.
         folder: output folder for the levels and a manifest; see :meth:`Levels.save`. A name that ends in
@@ -261,7 +263,7 @@ def lod(
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
         SceneError: if no Gaussian can be drawn, or a file or the folder is not usable.
         DataError: if ``sh`` needs views and there are none.
-        PointSplatError: if ``sh`` is unknown.
+        PointSplatError: if ``sh`` or the effort is unknown.
 
     Example:
         >>> import pointsplat_ns as ps
@@ -270,14 +272,14 @@ def lod(
         [(1572, True), (786, True), (100, True)]
     """
     budgets = parse_levels(levels)  # these checks come before the scene is read
-    request = PruneRequest(1.0, sh=sh)
+    request, repair = PruneRequest(1.0, sh=sh), RepairBudget(effort)
     output = LevelOutput.of(folder, stream, tiles, at, up, force)
     if output is not None:
         output.check(len(budgets))
     dense, view_source = read_source(scene, Looking(views, resolution, up, data))
     source = None if isinstance(scene, Gaussians) else source_file(scene)
     with progress_bar(progress) as report:
-        made = make_levels(dense, budgets, request, view_source, source, report)
+        made = make_levels(dense, budgets, request, view_source, source, report, repair)
         made = made if output is None else output.write(made, report)
     log(made.notes)
     return made

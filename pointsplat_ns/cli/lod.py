@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pointsplat_ns.cli import scene_options as options
 from pointsplat_ns.cli.printing import print_json, psnr_text
@@ -23,6 +23,7 @@ def lod(
     tiles: bool = False,
     at: str | None = None,
     sh: options.Bands = "all",
+    effort: Literal["instant", "quick", "thorough"] = "instant",
     poses: options.Poses = None,
     resolution: options.Resolution = None,
     up: options.Up = None,
@@ -52,6 +53,7 @@ def lod(
             longitude and height of its origin in degrees and metres (48.86,2.29,35; --at=-33.9,... in the south), with
             up turned to the zenith. By default they have the frame of the scene's file.
         sh: SH bands of every level: all, up to a degree, or auto, the lowest degree whose renders reach 40 dB.
+        effort: length of the repair of each level, as for compact: none (instant), quick, or thorough.
         json_output: print the manifest, and nothing else on standard output.
     """
     options.need_scenes(scene)
@@ -63,8 +65,9 @@ def lod(
     folder = output or options.output_beside(scene, "stream" if stream else "tiles" if tiles else "lod", "")
     for_viewers = stream or tiles or folder.suffix.lower() == ".rad"
     made = ps.lod(
-        scene, ("100%", *levels) if for_viewers else levels, sh=sh, views=poses, resolution=resolution, up=up,
-        data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force, progress=True,
+        scene, ("100%", *levels) if for_viewers else levels, sh=sh, effort=effort, views=poses,
+        resolution=resolution, up=up, data=data, folder=folder, stream=stream, tiles=tiles, at=at, force=force,
+        progress=True,
     )  # fmt: skip
     if json_output and for_viewers:
         print_json({"output": folder, "levels": [level.facts(len(made.dense)) for level in made]})
@@ -72,6 +75,8 @@ def lod(
         print_json({"output": folder, **json.loads((folder / FOLDER_FILES.levels).read_text("utf-8"))})
     else:
         _print_table(made, folder)
+    if made.interrupted:
+        raise KeyboardInterrupt  # once the levels are written and printed
 
 
 def _print_table(made: Levels, folder: Path) -> None:

@@ -8,6 +8,7 @@ import itertools
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.acceptance import Comparison
@@ -17,7 +18,7 @@ from pointsplat_ns.compression.photo_repair import PHOTO_REPAIR, PhotoRepaired, 
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, decibels, through_file
 from pointsplat_ns.compression.repair import repair
-from pointsplat_ns.compression.requests import CompactRequest
+from pointsplat_ns.compression.requests import CompactRequest, RepairBudget
 from pointsplat_ns.compression.trained_refiner import TrainedRefiner
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
@@ -74,14 +75,14 @@ def compact_scene(
     repairing, budget = judge if comparable else None, request.photos
     training = None if budget is None or budget.empty else photos
     if repairing is not None and (training is None or len(left.scene) > PHOTO_REPAIR.large):
-        stages.append(_repaired(left, at_work, request, repairing, views, progress))
+        stages.append(repaired_stage(left, at_work, request.repair, repairing, views, progress, request.unfinished))
         repairing = None
     if training is not None and budget is not None and not stages[-1].interrupted:
         progress("training on photos", 0.0)
         report, scene = functools.partial(progress, "training on photos"), last_kept(stages).scene.to(at_work.device)
         trained = photo_repair(scene, at_work, training, views, budget, report)
         if repairing is not None and trained.why_not() and not trained.interrupted:
-            stages.append(_repaired(left, at_work, request, repairing, views, progress))
+            stages.append(repaired_stage(left, at_work, request.repair, repairing, views, progress, request.unfinished))
             if stages[-1].accepted:
                 trained = trained.beside(stages[-1].scene.to(at_work.device), training)
         stages.append(_trained(last_kept(stages), trained, reference))
@@ -108,15 +109,21 @@ def _refined(
     return Stage("refine", refined, after, last.after, reason)
 
 
-def _repaired(
-    last: Stage, dense: Gaussians, request: CompactRequest, judge: Comparison, views: ViewSource, progress: Progress
+def repaired_stage(
+    last: Stage,
+    dense: Gaussians,
+    budget: RepairBudget,
+    judge: Comparison,
+    views: ViewSource,
+    progress: Progress,
+    unfinished: Path | None = None,
 ) -> Stage:
     """The repair of the last stage that was kept, which was compared; ``dense`` is on the device that renders."""
     assert last.after is not None
     progress("repairing", 0.0)
     report = functools.partial(progress, "repairing")
     scene, psnr = last.scene.to(dense.device), last.after.psnr
-    repaired = repair(scene, dense, views, request.repair, report, psnr=psnr, unfinished=request.unfinished)
+    repaired = repair(scene, dense, views, budget, report, psnr=psnr, unfinished=unfinished)
     after, reason = judge.judged(last.after, last.scene, repaired.scene)
     scene, figures = repaired.scene.to(last.scene.device), (repaired.steps, repaired.seconds, repaired.interrupted)
     return Stage("repair", scene, after, last.after, reason, *figures)

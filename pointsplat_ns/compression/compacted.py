@@ -138,7 +138,7 @@ class Compacted:
     def verdict(self) -> str:
         """A line of text for each stage after pruning: its gain, or the reason to leave it out. One line if there is no
         such stage."""
-        lines = [_line(stage) for stage in self.stages[1:]]
+        lines = [stage_text(stage) for stage in self.stages[1:]]
         if lines:
             return "\n".join(lines)
         if self.before is None:
@@ -151,7 +151,8 @@ def last_kept(stages: Sequence[Stage]) -> Stage:
     return next(stage for stage in reversed(stages) if stage.accepted)
 
 
-def _line(stage: Stage) -> str:
+def stage_text(stage: Stage) -> str:
+    """A line of text: what a stage gains, or the reason to leave it out."""
     cost = f" by {counted(stage.steps, 'step')} in {stage.seconds:.1f} s" if stage.name in ("repair", "photos") else ""
     cost += ", interrupted" if stage.interrupted else ""
     done = stage.done + {"refine": " by the network", "round": " for the size of the file"}.get(stage.name, "")

@@ -1,12 +1,13 @@
 """Levels of detail: a scene merged to ever fewer Gaussians in one pass, with the error of each level.
 
 Each level is merged from the level before, so levels are nested: every Gaussian has one parent in the next coarser
-level.
+level. A repair moves the Gaussians of a level, and keeps their parents.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,9 +18,12 @@ import torch
 from torch import Tensor
 
 from pointsplat_ns.comparing.closeness import DenseReference
+from pointsplat_ns.compression.acceptance import Comparison
+from pointsplat_ns.compression.compact import repaired_stage
+from pointsplat_ns.compression.compacted import Stage, stage_text
 from pointsplat_ns.compression.prune import prune_scene
 from pointsplat_ns.compression.quality import Judge, Quality
-from pointsplat_ns.compression.requests import PruneRequest
+from pointsplat_ns.compression.requests import PruneRequest, RepairBudget, default_device
 from pointsplat_ns.errors import BudgetError, DataError, PointSplatError
 from pointsplat_ns.gaussians import Gaussians, Traits
 from pointsplat_ns.geometry.earth import Place
@@ -53,7 +57,9 @@ class Level:
     quality: Quality | None
     """How close its renders are to the dense scene's; None if there is no view."""
     seconds: float
-    """Duration of merging from the level before."""
+    """Duration of merging from the level before, and of the repair."""
+    repair: Stage | None = None
+    """The repair of the level, kept or not; None if there was none."""
 
     def facts(self, whole: int) -> dict[str, Any]:
         """The manifest's entry of the level; ``whole`` is the number of Gaussians of the dense scene."""
@@ -63,6 +69,7 @@ class Level:
             "share": len(self.scene) / whole,
             "sh_degree": self.scene.sh_degree,
             "dropped": self.dropped,
+            "repaired": self.repair is not None and self.repair.accepted,
             "psnr": near and near.psnr,
             "worst_psnr": near and near.worst,
             "ssim": near and near.ssim,
@@ -103,6 +110,11 @@ class Levels:
     def scenes(self) -> list[Gaussians]:
         """The scene of each level."""
         return [level.scene for level in self]
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended a repair early; levels after it are not repaired."""
+        return any(level.repair is not None and level.repair.interrupted for level in self)
 
     @property
     def parents(self) -> list[Tensor]:
@@ -263,6 +275,7 @@ def make_levels(
     views: ViewSource,
     source: SourceFile | None,
     progress: Progress,
+    budget: RepairBudget,
 ) -> Levels:
     """Make levels of detail in one pass, and measure each level as soon as it is made.
 
@@ -273,6 +286,7 @@ def make_levels(
         views: source of the views to compare renders in; merging uses them too where they are known.
         source: the file of ``dense``, for the manifest.
         progress: called with the name of the current task and the share of it that is done, in [0, 1].
+        budget: of the repair of each level. Levels are merged from unrepaired ones.
 
     Raises:
         BudgetError: if a level does not fit the scene, or two levels have the same number of Gaussians.
@@ -291,13 +305,30 @@ def make_levels(
         notes = (*notes, f"the levels' errors are not measured: {error}")
     if views.origin and views.text not in notes:
         notes = (views.text, *notes)
+    comparison, at_work = None, dense
+    if judge is not None and not budget.empty:
+        at_work = dense.to(default_device())
+        comparison = Comparison(at_work, views)
     made: list[Level] = []
     start = time.perf_counter()
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
+        which, scene, repair = f"level {len(made)}", merged.scene, None
+        interrupted = any(level.repair is not None and level.repair.interrupted for level in made)
+        if comparison is not None and len(scene) < len(cut.scene) and not interrupted:
+            before = comparison.reference.closeness(scene.to(at_work.device))
+            if before.psnr < math.inf:
+                report = functools.partial(_of_level, progress, which)
+                repair = repaired_stage(Stage("merge", scene, before), at_work, budget, comparison, views, report)
+                scene = repair.scene if repair.accepted else scene
+                notes = (*notes, f"{which}: {stage_text(repair)}")
         seconds = time.perf_counter() - start
-        progress(f"judging level {len(made)} of {len(counts) - 1}", 0.0)
-        quality = None if judge is None else judge.quality(merged.scene)
+        progress(f"judging {which} of {len(counts) - 1}", 0.0)
+        quality = None if judge is None else judge.quality(scene)
         dropped = int((merged.assignment < 0).sum())
-        made.append(Level(merged.scene, merged.assignment, dropped, quality, seconds))
+        made.append(Level(scene, merged.assignment, dropped, quality, seconds, repair))
         start = time.perf_counter()
     return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)
+
+
+def _of_level(progress: Progress, which: str, what: str, share: float) -> None:
+    progress(f"{which}: {what}", share)

@@ -12,6 +12,7 @@ import pointsplat_ns as ps
 from making import ball, same
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression.quality import Judge
+from pointsplat_ns.compression.requests import STEPS
 from pointsplat_ns.io.formats.sog_stream import read_sog_stream
 from pointsplat_ns.levels import folder as level_folder
 from pointsplat_ns.levels.stream import Node, partition
@@ -55,10 +56,26 @@ def manifest_of(folder: Path) -> dict:
     return json.loads((folder / "lod.json").read_text("utf-8"), parse_constant=refuse)
 
 
-def test_a_level_alone_is_what_prune_gives(scene, views):
+def test_a_level_alone_is_what_prune_and_compact_give(scene, views, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 24)
     alone = ps.lod(scene, ["50%"], views=views)[0].scene
     assert same(alone, ps.prune(scene, "50%", views=views))
     assert not same(alone, ps.prune(scene, "50%")), "merging looks from the views"
+    [repaired] = ps.lod(scene, ["50%"], views=views, effort="quick")
+    expected = ps.compact(scene, "50%", views=views, effort="quick")
+    assert repaired.repair.accepted and repaired.facts(400)["repaired"] and expected.repair_accepted
+    assert same(repaired.scene, expected.scene)
+
+
+def test_levels_after_an_interrupted_repair_are_only_merged(scene, levels, views, monkeypatch):
+    monkeypatch.setitem(STEPS, "quick", 4)
+    def report(what: str, share: float) -> None:
+        if what == "level 1: repairing" and share > 0:
+            raise KeyboardInterrupt
+
+    made = ps.lod(scene, ["100%", *ASKED], views=views, effort="quick", progress=report)
+    assert made.interrupted and [level.repair is not None for level in made] == [False, True, False, False, False]
+    assert all(map(same, made.scenes[2:], levels.scenes[1:]))
 
 
 def test_the_manifest_is_true_of_the_files(folder, scene, views):
