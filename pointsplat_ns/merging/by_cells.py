@@ -33,9 +33,9 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_of_round, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
-from pointsplat_ns.merging.rounds import merge, most_pairs
+from pointsplat_ns.merging.rounds import merge
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state, principal_axes
 from pointsplat_ns.merging.visibility import views_and_weights
@@ -181,7 +181,7 @@ class _Work:
             found = self.cells.scratch.known(_round(number, cell))
             left += len(found["means"])
             prices.append(found["prices"])
-        chosen = lowest(prices, min(left - self.k, most_pairs(left, self.settings)))
+        chosen = lowest(prices, pairs_of_round(prices, left, self.k, self.settings))
         merged = sum(int(part.sum()) for part in chosen)
         return {**{f"{cell}": part for cell, part in enumerate(chosen)}, "left": torch.tensor(left - merged, **INDICES)}
 

@@ -25,7 +25,7 @@ from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_of_round, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
@@ -38,6 +38,9 @@ from pointsplat_ns.views import Views
 logger = logging.getLogger("pointsplat_ns")
 
 Result = TypeVar("Result")
+
+Pairs = tuple[Tensor, Tensor, Tensor]
+"""First and second members, and prices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +136,10 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
 
 
 class Merger:
-    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds before the last one of
-    a count, are those of every smaller count as well, and are made once.
+    """Merges one scene to several counts, each as :func:`merge` does. The views, the weights and the pairs of the first
+    round are those of every count, and are found once.
 
-    The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
+    What is kept takes at most 0.4 kB for each Gaussian of the scene.
 
     Args:
         scene, views, settings: as for :func:`merge`.
@@ -144,7 +147,7 @@ class Merger:
 
     def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
         self._scene, self._device, self._options = scene, scene.device, (views, settings)
-        self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
+        self._begun: tuple[Step, Pairs] | None = None
 
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
@@ -153,23 +156,22 @@ class Merger:
 
         def on(scene: Gaussians) -> Merged:
             if scene is not self._scene:  # it was moved, which the steps before were not
-                self._scene, self._steps = scene, []
+                self._scene, self._begun = scene, None
             return self._merged(k, report)
 
         return _on_cpu_if_too_large(self._scene, on).to(self._device)
 
     def _merged(self, k: int, report: Callable[[float], None]) -> Merged:
         views, settings = self._options
-        if not self._steps and 1 <= k < len(self._scene):
-            self._steps.append(first_step(self._scene, 1, views, settings, report=report))
-        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # faint Gaussians are among them
+        if self._begun is None and 1 <= k < len(self._scene):
+            step = first_step(self._scene, 1, views, settings, report=report)
+            self._begun = step, pairs_of(step, settings)
+        if self._begun is None or not 1 <= k <= len(self._begun[0].state):  # faint Gaussians are among them
             return merge(self._scene, k, report, views, settings)
-        step = next(step for step in reversed(self._steps) if len(step.state) >= k)
+        step, pairs = self._begun
         first = len(step.state)
-        while (n := len(step.state)) > k:
-            shared = step is self._steps[-1] and n - most_pairs(n, settings) >= k
-            step = one_round(step, k, settings)
-            self._steps += [step] if shared else []
+        while len(step.state) > k:
+            step = one_round(step, k, settings, pairs if len(step.state) == first else None)
             report(_share_done(first, len(step.state), k))
         merged = _result(step, True, settings)
         report(1.0)
@@ -261,21 +263,20 @@ def first_step(
         return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
 
 
-def most_pairs(n: int, settings: MergeSettings) -> int:
-    """Largest number of pairs that a round merges of ``n`` Gaussians."""
-    return max(1, int(n * settings.round_share))
-
-
-def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
-    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    n = len(step.state)
-    most = min(n - k, most_pairs(n, settings))
+def pairs_of(step: Step, settings: MergeSettings) -> Pairs:
+    """The pairs that may be merged next, as of :func:`~pointsplat_ns.merging.pairs.cheapest_pairs`."""
     with one_thread_each():
         give_back_freed_memory()
         near = other_neighbours(step.state.means.double(), settings.neighbours)
         costs = pair_costs(step.state, near, settings)
-        first, second, _ = cheapest_pairs(near, costs, settings.matching_passes)
-        del near, costs
+        return cheapest_pairs(near, costs, settings.matching_passes)
+
+
+def one_round(step: Step, k: int, settings: MergeSettings, pairs: Pairs | None = None) -> Step:
+    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
+    first, second, prices = pairs or pairs_of(step, settings)
+    with one_thread_each():
+        most = pairs_of_round([prices], len(step.state), k, settings)
         give_back_freed_memory()
         state, merged = replace_pairs(step.state, first[:most], second[:most], settings)
         return _with_reference(replace(step, state=state, rounds=(*step.rounds, merged)), settings)

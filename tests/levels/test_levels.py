@@ -69,6 +69,7 @@ def test_a_level_alone_is_what_prune_and_compact_give(scene, views, monkeypatch)
 
 def test_levels_after_an_interrupted_repair_are_only_merged(scene, levels, views, monkeypatch):
     monkeypatch.setitem(STEPS, "quick", 4)
+
     def report(what: str, share: float) -> None:
         if what == "level 1: repairing" and share > 0:
             raise KeyboardInterrupt
