@@ -57,12 +57,12 @@ def manifest_of(folder: Path) -> dict:
 
 
 def test_a_level_alone_is_what_prune_and_compact_give(scene, views, monkeypatch):
-    monkeypatch.setitem(STEPS, "quick", 24)
+    monkeypatch.setitem(STEPS, "quick", 60)
     alone = ps.lod(scene, ["50%"], views=views)[0].scene
     assert same(alone, ps.prune(scene, "50%", views=views))
     assert not same(alone, ps.prune(scene, "50%")), "merging looks from the views"
-    [repaired] = ps.lod(scene, ["50%"], views=views, effort="quick")
-    expected = ps.compact(scene, "50%", views=views, effort="quick")
+    [repaired] = ps.lod(scene, ["10%"], views=views, effort="quick")
+    expected = ps.compact(scene, "10%", views=views, effort="quick")
     assert repaired.repair.accepted and repaired.facts(400)["repaired"] and expected.repair_accepted
     assert same(repaired.scene, expected.scene)
 
