@@ -5,7 +5,6 @@ import torch
 
 import golden
 from lab.speed import cuda
-from pointsplat_ns.errors import PointSplatError
 
 
 def test_every_check_passes_where_both_devices_are_the_cpu(coarse_rooms, capsys):
@@ -43,8 +42,3 @@ def test_checks_that_fail_are_said_and_end_it_with_status_1(monkeypatch, capsys)
     printed = capsys.readouterr().out
     assert ended.value.code == 1
     assert "FAIL  golden pictures" in printed and "FAIL  times of torch" in printed and "6 of 8 passed" in printed
-
-
-def test_options_without_a_meaning_are_refused():
-    with pytest.raises(PointSplatError, match="1 steps, every 1; expected at least 2 steps"):
-        cuda.main(device="cpu", steps=1)

@@ -2,14 +2,12 @@
 
 import random
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
 import torch
 
 from lab import feedback_training
 from lab.feedback_training import FeedbackTrainingSettings, TrainingScene, roll_out, train_feedback
-from pointsplat_ns.errors import DataError
 from pointsplat_ns.refiner.feedback import FeedbackRefiner, read_feedback_refiner
 
 
@@ -34,10 +32,3 @@ def test_training_brings_repairs_closer(small, tmp_path):
     assert reached(network) > reached(FeedbackRefiner()) + 0.05
     saved = read_feedback_refiner(tmp_path / "a.safetensors")
     assert reached(saved) == pytest.approx(reached(network), abs=1e-4)
-
-
-def test_scenes_that_cannot_be_trained_on_are_refused(small):
-    with pytest.raises(DataError, match="no scene"):
-        train_feedback([], 1)
-    with pytest.raises(DataError, match="ball: 8 views; expected at least 9"):
-        train_feedback([replace(small, views=(small.views[0][:8], small.views[1][:8]))], 1)

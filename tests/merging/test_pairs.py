@@ -125,20 +125,17 @@ def after(scene: Gaussians, group: torch.Tensor, count: int) -> torch.Tensor:
     return found
 
 
-@pytest.mark.parametrize("spread", [0.0, 1.0, 70.0])
+@pytest.mark.parametrize("spread", [1.0, 70.0])
 def test_a_round_merges_what_is_below_the_price_that_leaves_the_count(spread):
-    """From float64, sorted, with prices over as many decades as float32 has; zeros and infinities among them."""
+    """From sorted float64, with prices over as many decades as float32 has; zeros and infinities among them."""
     prices = 10 ** (spread * (torch.rand(4000, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 0.5))
-    prices[::9], prices[::11] = 0.0, math.inf if spread else 1.0
+    prices[::9], prices[::11] = 0.0, math.inf
     powers = prices.sort().values.sqrt()
     gone = 2 * torch.arange(1, 4001) - (powers.cumsum(0) / powers).nan_to_num(math.inf)
     for k in (9500, 9000, 7000, 5000, 2000, 30):
-        enough = (gone >= 10_000 - k).nonzero()
-        wanted = int(enough[0]) + 1 if len(enough) else int(prices.isfinite().sum())
-        found = pairs_of_round(prices.float().split([0, 1500, 2500]), 10_000, k)
-        assert found <= 10_000 - k and (found >= 500 or found == 10_000 - k)
-        if wanted > 500 and spread:
-            assert abs(found - wanted) <= 2
+        enough, found = gone >= 10_000 - k, pairs_of_round(prices.float().split([0, 1500, 2500]), 10_000, k)
+        wanted = int(enough.nonzero()[0]) + 1 if enough.any() else int(prices.isfinite().sum())
+        assert abs(found - max(wanted, 500)) <= 2
     assert pairs_of_round([torch.ones(4000)], 10_000, 7000) == 3000
 
 
