@@ -64,7 +64,7 @@ PAGE = f"""# With the photos at hand
 `lab/training/with_photos.py` measured [with_photos.json](with_photos.json) and writes this page from it. Constants of
 `{COMPACTED}` are chosen on fox, kitchen and vr_project. The others judge.
 
-- Figures of a scene are CPU seconds, PSNR (dB) and LPIPS, means over held-out photos; "-" was not measured.
+- Figures of a scene are CPU seconds/PSNR (dB)/LPIPS, means over held-out photos; "-" was not measured.
 - CPU seconds are of one thread of a busy machine: equal work differs by up to a half.
 - `{COMPACTED}` trains for {PHOTO_STEPS["quick"]:,} steps.
 - "{SCORES["lightgaussian"]}" and PUP-3DGS train the Gaussians with the highest scores as `{COMPACTED}` does, for as
@@ -189,7 +189,7 @@ def scene_table(rows: list[Row]) -> str:
 
 def _cell(row: Row) -> str:
     """The figures of a row that it has, "-" for none."""
-    return ", ".join(format(row[name], form) for name, form in FIGURES.items() if name in row) or "-"
+    return "/".join(format(row[name], form) for name, form in FIGURES.items() if name in row) or "-"
 
 
 def lead_table(rows: list[Row]) -> str:
