@@ -110,17 +110,17 @@ def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
     return rows, others.T.contiguous(), key.where(once < math.inf, NEVER).T.contiguous()
 
 
-def pairs_of_round(prices: Sequence[Tensor], n: int, k: int, settings: MergeSettings = MERGING) -> int:
-    """How many of the cheapest pairs a round merges, of ``n`` Gaussians of which ``k`` are to remain: those that are
-    cheaper than what all rounds have to pay at most.
+def pairs_by_price(prices: Sequence[Tensor], n: int, k: int, settings: MergeSettings = MERGING) -> int:
+    """How many of the cheapest pairs a round merges, of ``n`` Gaussians of which ``k`` are to remain, if rounds pay no
+    higher price than need be.
 
     That price P is foreseen. If the pair of a replacement costs g times as much as the pair that it replaced, and so
     on, and rounds merge all up to P, then of the two Gaussians of a pair of price p
 
         (p / P)^b,  b = log 2 / log g
 
-    remain. P is where that leaves ``k`` in all; g is ``price_growth``. So what is hidden goes before anything that
-    shows, and where all prices are alike, all merge evenly.
+    remain. P is where that leaves ``k`` in all; g is ``price_growth``. So what no view shows goes before anything that
+    shows.
 
     Args:
         prices: some parts of the prices of all pairs, float32, at least 0, in any order.

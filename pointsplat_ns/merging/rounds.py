@@ -25,7 +25,7 @@ from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_of_round, replace_pairs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_by_price, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
@@ -38,9 +38,6 @@ from pointsplat_ns.views import Views
 logger = logging.getLogger("pointsplat_ns")
 
 Result = TypeVar("Result")
-
-Pairs = tuple[Tensor, Tensor, Tensor]
-"""First and second members, and prices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +133,10 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
 
 
 class Merger:
-    """Merges one scene to several counts, each as :func:`merge` does. The views, the weights and the pairs of the first
-    round are those of every count, and are found once.
+    """Merges one scene to several counts, each as :func:`merge` does. The views are those of every count, and are found
+    once; where they are guessed, all rounds before the last one of a count are those of every smaller count as well.
 
-    What is kept takes at most 0.4 kB for each Gaussian of the scene.
+    The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
 
     Args:
         scene, views, settings: as for :func:`merge`.
@@ -147,7 +144,7 @@ class Merger:
 
     def __init__(self, scene: Gaussians, views: Views | Sampler | None = None, settings: MergeSettings = MERGING):
         self._scene, self._device, self._options = scene, scene.device, (views, settings)
-        self._begun: tuple[Step, Pairs] | None = None
+        self._steps: list[Step] = []  # after rounds that merge as many pairs as they may
 
     @torch.no_grad()
     def merged(self, k: int, progress: Callable[[float], None] | None = None) -> Merged:
@@ -156,22 +153,23 @@ class Merger:
 
         def on(scene: Gaussians) -> Merged:
             if scene is not self._scene:  # it was moved, which the steps before were not
-                self._scene, self._begun = scene, None
+                self._scene, self._steps = scene, []
             return self._merged(k, report)
 
         return _on_cpu_if_too_large(self._scene, on).to(self._device)
 
     def _merged(self, k: int, report: Callable[[float], None]) -> Merged:
         views, settings = self._options
-        if self._begun is None and 1 <= k < len(self._scene):
-            step = first_step(self._scene, 1, views, settings, report=report)
-            self._begun = step, pairs_of(step, settings)
-        if self._begun is None or not 1 <= k <= len(self._begun[0].state):  # faint Gaussians are among them
+        if not self._steps and 1 <= k < len(self._scene):
+            self._steps.append(first_step(self._scene, 1, views, settings, report=report))
+        if not self._steps or not 1 <= k <= len(self._steps[0].state):  # faint Gaussians are among them
             return merge(self._scene, k, report, views, settings)
-        step, pairs = self._begun
+        step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
-        while len(step.state) > k:
-            step = one_round(step, k, settings, pairs if len(step.state) == first else None)
+        while (n := len(step.state)) > k:
+            shared = step is self._steps[-1] and not step.known and n - most_pairs(n, settings) >= k
+            step = one_round(step, k, settings)
+            self._steps += [step] if shared else []
             report(_share_done(first, len(step.state), k))
         merged = _result(step, True, settings)
         report(1.0)
@@ -226,6 +224,7 @@ class Step:
 
     participants: Participants
     views: Views | None  # that visibility was computed in
+    known: bool  # whether these views are known, not guessed
     state: State
     rounds: tuple[Round, ...] = ()
     reference: RendersOfSizes | None = None
@@ -260,23 +259,26 @@ def first_step(
         found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
-        return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
+        return _with_reference(
+            Step(participants, found, isinstance(views, Views), initial_state(participants, weights)), settings
+        )
 
 
-def pairs_of(step: Step, settings: MergeSettings) -> Pairs:
-    """The pairs that may be merged next, as of :func:`~pointsplat_ns.merging.pairs.cheapest_pairs`."""
+def most_pairs(n: int, settings: MergeSettings) -> int:
+    """Largest number of pairs that a round merges of ``n`` Gaussians where views are guessed."""
+    return max(1, int(n * settings.round_share))
+
+
+def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
+    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
+    n = len(step.state)
     with one_thread_each():
         give_back_freed_memory()
         near = other_neighbours(step.state.means.double(), settings.neighbours)
         costs = pair_costs(step.state, near, settings)
-        return cheapest_pairs(near, costs, settings.matching_passes)
-
-
-def one_round(step: Step, k: int, settings: MergeSettings, pairs: Pairs | None = None) -> Step:
-    """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
-    first, second, prices = pairs or pairs_of(step, settings)
-    with one_thread_each():
-        most = pairs_of_round([prices], len(step.state), k, settings)
+        first, second, prices = cheapest_pairs(near, costs, settings.matching_passes)
+        del near, costs
+        most = pairs_by_price([prices], n, k, settings) if step.known else min(n - k, most_pairs(n, settings))
         give_back_freed_memory()
         state, merged = replace_pairs(step.state, first[:most], second[:most], settings)
         return _with_reference(replace(step, state=state, rounds=(*step.rounds, merged)), settings)
