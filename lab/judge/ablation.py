@@ -52,7 +52,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "neighbours_8": dict(neighbours=8),
     "round_share_0.3": dict(round_share=0.3),
     "round_share_0.5": dict(round_share=0.5),
-    "price_growth_8": dict(price_growth=8.0),
     "matching_passes_3": dict(matching_passes=3),
     "background_decay_1": dict(background_decay=1.0),
     "min_cover_0.1": dict(min_cover=0.1),

@@ -33,7 +33,7 @@ from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_by_price, replace_pairs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
@@ -124,7 +124,6 @@ class Overview:
 
     centre: Tensor  # [3] float64, of the content
     size: Tensor  # scalar float64, diagonal of the content, scene units
-    known: Tensor  # scalar bool, whether views are known, not guessed
     keys: Tensor  # [m] int64, ascending places on the curve
     weights: Tensor  # [m] float32, visibility weights there
     middle: Tensor  # [3 (d+1)^2] as of principal_axes
@@ -140,8 +139,7 @@ def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -
     _, weights = views_and_weights(participants, views, settings)
     axes = principal_axes(scene, members)
     size = torch.tensor(participants.size, **DOUBLES)
-    known = torch.tensor(isinstance(views, Views))
-    return Overview(participants.centre, size, known, cells.keys[members], weights, *axes)
+    return Overview(participants.centre, size, cells.keys[members], weights, *axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,10 +181,7 @@ class _Work:
             found = self.cells.scratch.known(_round(number, cell))
             left += len(found["means"])
             prices.append(found["prices"])
-        most = min(left - self.k, most_pairs(left, self.settings))
-        if self.overview.known:
-            most = pairs_by_price(prices, left, self.k, self.settings)
-        chosen = lowest(prices, most)
+        chosen = lowest(prices, min(left - self.k, most_pairs(left, self.settings)))
         merged = sum(int(part.sum()) for part in chosen)
         return {**{f"{cell}": part for cell, part in enumerate(chosen)}, "left": torch.tensor(left - merged, **INDICES)}
 

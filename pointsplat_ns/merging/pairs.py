@@ -17,7 +17,6 @@ both members cover and the replacement covers once. Where a_k is above the large
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -41,8 +40,6 @@ from pointsplat_ns.system.threads import in_threads, in_turn
 
 NEVER = torch.iinfo(torch.int64).max
 """Key of a pair that cannot be."""
-
-FLOAT32 = torch.finfo(torch.float32)
 
 
 def cheapest_pairs(near: Tensor, costs: Tensor, passes: int = MERGING.matching_passes) -> tuple[Tensor, Tensor, Tensor]:
@@ -108,42 +105,6 @@ def _pairs(near: Tensor, costs: Tensor, here: slice) -> tuple[Tensor, ...]:
     hashed = ((rows[:, None] * k + slots) * 2654435761) & 0xFFFFFFFF
     key = (once.view(torch.int32).long() << 32) | hashed
     return rows, others.T.contiguous(), key.where(once < math.inf, NEVER).T.contiguous()
-
-
-def pairs_by_price(prices: Sequence[Tensor], n: int, k: int, settings: MergeSettings = MERGING) -> int:
-    """How many of the cheapest pairs a round merges, of ``n`` Gaussians of which ``k`` are to remain, if rounds pay no
-    higher price than need be.
-
-    That price P is foreseen. If the pair of a replacement costs g times as much as the pair that it replaced, and so
-    on, and rounds merge all up to P, then of the two Gaussians of a pair of price p
-
-        (p / P)^b,  b = log 2 / log g
-
-    remain. P is where that leaves ``k`` in all; g is ``price_growth``. So what no view shows goes before anything that
-    shows.
-
-    Args:
-        prices: some parts of the prices of all pairs, float32, at least 0, in any order.
-
-    Returns:
-        At most ``n - k``, and at least a twentieth of ``n`` if that is less: else the last rounds would be many.
-    """
-    power = math.log(2) / math.log(settings.price_growth)
-    powers = [part**power for part in prices]
-    low, high = (_bits(bound) for bound in (FLOAT32.tiny, FLOAT32.max))  # ordered as the numbers are
-    while low < high:
-        middle = (low + high) // 2
-        limit = float(torch.tensor(middle, dtype=torch.int32).view(torch.float32))
-        within = [part[part <= limit] for part in powers]
-        left = sum(float(part.sum(dtype=torch.float64)) for part in within) / limit
-        enough = 2 * sum(map(len, within)) - left >= n - k
-        low, high = (low, middle) if enough else (middle + 1, high)
-    found = sum(int((part.view(torch.int32) <= low).sum()) for part in powers)
-    return min(n - k, max(found, n // 20, 1))
-
-
-def _bits(value: float) -> int:
-    return int(torch.tensor(value, dtype=torch.float32).view(torch.int32))
 
 
 class Round(NamedTuple):

@@ -25,7 +25,7 @@ from pointsplat_ns.looking.content import in_units, views_in_units
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.groups import Groups, best_size_change, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
-from pointsplat_ns.merging.pairs import Round, cheapest_pairs, pairs_by_price, replace_pairs
+from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
 from pointsplat_ns.merging.state import Participants, State, drawable, initial_state
@@ -133,8 +133,8 @@ def _on_cpu_if_too_large(scene: Gaussians, function: Callable[[Gaussians], Resul
 
 
 class Merger:
-    """Merges one scene to several counts, each as :func:`merge` does. The views are those of every count, and are found
-    once; where they are guessed, all rounds before the last one of a count are those of every smaller count as well.
+    """Merges one scene to several counts, each as :func:`merge` does. The views, and all rounds before the last one of
+    a count, are those of every smaller count as well, and are made once.
 
     The steps that are kept take at most 0.4 kB for each Gaussian of the scene.
 
@@ -167,7 +167,7 @@ class Merger:
         step = next(step for step in reversed(self._steps) if len(step.state) >= k)
         first = len(step.state)
         while (n := len(step.state)) > k:
-            shared = step is self._steps[-1] and not step.known and n - most_pairs(n, settings) >= k
+            shared = step is self._steps[-1] and n - most_pairs(n, settings) >= k
             step = one_round(step, k, settings)
             self._steps += [step] if shared else []
             report(_share_done(first, len(step.state), k))
@@ -224,7 +224,6 @@ class Step:
 
     participants: Participants
     views: Views | None  # that visibility was computed in
-    known: bool  # whether these views are known, not guessed
     state: State
     rounds: tuple[Round, ...] = ()
     reference: RendersOfSizes | None = None
@@ -259,26 +258,24 @@ def first_step(
         found, weights = None, torch.ones_like(participants.members, dtype=torch.float32)
         if len(participants) > last:
             found, weights = views_and_weights(participants, views, settings, lambda share: report(0.5 * share))
-        return _with_reference(
-            Step(participants, found, isinstance(views, Views), initial_state(participants, weights)), settings
-        )
+        return _with_reference(Step(participants, found, initial_state(participants, weights)), settings)
 
 
 def most_pairs(n: int, settings: MergeSettings) -> int:
-    """Largest number of pairs that a round merges of ``n`` Gaussians where views are guessed."""
+    """Largest number of pairs that a round merges of ``n`` Gaussians."""
     return max(1, int(n * settings.round_share))
 
 
 def one_round(step: Step, k: int, settings: MergeSettings) -> Step:
     """The step after some more pairs are merged; at least ``k`` Gaussians remain."""
     n = len(step.state)
+    most = min(n - k, most_pairs(n, settings))
     with one_thread_each():
         give_back_freed_memory()
         near = other_neighbours(step.state.means.double(), settings.neighbours)
         costs = pair_costs(step.state, near, settings)
-        first, second, prices = cheapest_pairs(near, costs, settings.matching_passes)
+        first, second, _ = cheapest_pairs(near, costs, settings.matching_passes)
         del near, costs
-        most = pairs_by_price([prices], n, k, settings) if step.known else min(n - k, most_pairs(n, settings))
         give_back_freed_memory()
         state, merged = replace_pairs(step.state, first[:most], second[:most], settings)
         return _with_reference(replace(step, state=state, rounds=(*step.rounds, merged)), settings)

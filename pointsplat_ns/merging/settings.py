@@ -49,14 +49,8 @@ class MergeSettings:
     """Number of nearest centres that a Gaussian may be merged with. 8 are 0.1 dB worse, 12 0.4."""
 
     round_share: float = 0.4
-    """Largest share of the remaining Gaussians that one round merges away where views are guessed. Smaller shares are
-    greedier and measured worse, and so are rounds by price (a bouquet loses 1.1 dB at 10 and at 50 %): the cost of a
-    pair does not include earlier losses of its members, and even thinning keeps losses small wherever people look."""
-
-    price_growth: float = 4.0
-    """Factor between the price of a pair and of the next one of its replacement, by which a round foresees the price up
-    to which pairs are merged where views are known (:func:`~pointsplat_ns.merging.pairs.pairs_by_price`). Against
-    ``round_share``, held-out photos gain 0.4 dB at 10, 30 and 50 % (fox); 2 and 8 are as good within 0.1 dB."""
+    """Largest share of the remaining Gaussians that one round merges away. Smaller shares are greedier and measured
+    worse: the cost of a pair does not include earlier losses of its members, and even thinning keeps losses small."""
 
     matching_passes: int = 6
     """Number of passes of a round that look for pairs among the Gaussians that are still free."""
