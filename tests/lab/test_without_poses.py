@@ -13,7 +13,9 @@ import pointsplat_ns as ps
 from captures import FRAMES, HEIGHT, OPENCV_TO_OPENGL, WIDTH, Capture, Lens
 from lab.judge import captures, without_poses
 from lab.judge.scenes import load, losses
-from making import run_of
+from making import box_room, run_of
+from pointsplat_ns.errors import SceneError
+from pointsplat_ns.io import write_ply
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
 
 KNOWN = captures.Capture("owner/name", "0" * 40, "images", "transforms.json", FRAMES, (WIDTH, HEIGHT), "room", "walls")
@@ -64,6 +66,12 @@ def test_photos_of_a_colmap_model_become_pinhole_pictures(tmp_path):
     assert len(points) == len(bent.seeds)
 
 
+def test_a_clone_of_another_repository_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"owner/name"):
+        captures.prepare(KNOWN, tmp_path, tmp_path / "ready", 960)
+    assert not (tmp_path / "ready").exists()
+
+
 def test_every_way_and_set_of_views_has_a_row(trained_walls, tmp_path):
     run = run_of(trained_walls, "wall-a")
     without_poses.main((run,), keep=(0.5,), views=2, json_path=tmp_path / "rows.json")
@@ -75,3 +83,9 @@ def test_every_way_and_set_of_views_has_a_row(trained_walls, tmp_path):
         given = {"sampled": None, "all": poses, "third": poses[::3]}[row["views"]]
         [(_, _, expected)] = losses(scene, [ps.prune(scene.dense, row["count"], views=given)], None)
         assert row["psnr"] == pytest.approx(expected["covered_psnr"], abs=1e-9)
+
+
+def test_a_ply_is_refused_as_it_has_no_held_out_poses(tmp_path):
+    write_ply(box_room(seed=3), tmp_path / "room.ply")
+    with pytest.raises(SceneError, match="expected a run"):
+        without_poses.main((tmp_path / "room.ply",))
