@@ -53,7 +53,10 @@ WAYS: dict[str, list[str]] = {
 }
 """What users of the program give to make a run smaller, but for the run and the budget."""
 
-SCORES = {"lightgaussian": "LightGaussian, trained on", "pup": "PUP-3DGS, trained on"}
+TRAINED = ", trained on"
+"""End of the names of ways whose scores training on photos follows."""
+
+SCORES = {"lightgaussian": f"LightGaussian{TRAINED}", "pup": f"PUP-3DGS{TRAINED}"}
 """Scores of prune that training on photos follows, and the names of these ways."""
 
 METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values())
@@ -66,9 +69,9 @@ PAGE = f"""# With the photos at hand
 
 - Figures of a scene are CPU seconds/PSNR (dB)/LPIPS, means over held-out photos; "-" was not measured.
 - CPU seconds are of one thread of a busy machine: equal work differs by up to a half.
-- `{COMPACTED}` trains for {PHOTO_STEPS["quick"]:,} steps.
-- "{SCORES["lightgaussian"]}" and PUP-3DGS train the Gaussians with the highest scores as `{COMPACTED}` does, for as
-  many CPU seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
+- Dense scenes are of 2,000 steps. `{COMPACTED}` trains for {PHOTO_STEPS["quick"]:,}.
+- LightGaussian and PUP-3DGS: the Gaussians with the highest scores, trained as `{COMPACTED}` does, for as many CPU
+  seconds as that takes in all. Their scoring comes on top. Their own schedules are longer.
 """
 
 LONG = f'- "{COMPACTED_LONG}" takes `--seconds` of the CPU seconds of the dense training: about half as many.'
@@ -169,11 +172,11 @@ def page(rows: list[Row]) -> str:
     parts = [PAGE.strip() + (f"\n{LONG}" if any(row["method"] == COMPACTED_LONG for row in rows) else "")]
     leads = lead_table(rows)
     if leads:
-        parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest to largest):\n\n{leads}")
+        parts.append(f"## Lead of `{COMPACTED}`\n\nPSNR in dB above each way, mean (smallest…largest):\n\n{leads}")
     for scene, same in sorted(grouped(rows, lambda row: row["scene"]).items()):
         dense = next(row for row in same if row["method"] == DENSE)
-        about = f"Dense: {dense['count']:,} Gaussians of {dense['steps']:,} steps, {_cell(dense)}"
-        photos = f"{dense['photos']} photos of {dense['width']} x {dense['height']}"
+        about = f"Dense: {dense['count']:,} Gaussians, {_cell(dense)}"
+        photos = f"{dense['photos']} photos of {dense['width']}x{dense['height']}"
         parts.append(f"## {scene}\n\n{about}. {photos}.\n\n{scene_table(same)}")
     return "\n\n".join(parts) + "\n"
 
@@ -183,7 +186,7 @@ def scene_table(rows: list[Row]) -> str:
     found = {(row["method"], row["keep"]): row for row in rows if row["method"] != DENSE}
     keeps = sorted({keep for _, keep in found}, reverse=True)
     ways = sorted({method for method, _ in found}, key=METHODS.index)
-    lines = [[way, *(_cell(found.get((way, keep), {})) for keep in keeps)] for way in ways]
+    lines = [[way.removesuffix(TRAINED), *(_cell(found.get((way, keep), {})) for keep in keeps)] for way in ways]
     return markdown(["way", *map(percent, keeps)], lines)
 
 
@@ -204,8 +207,8 @@ def lead_table(rows: list[Row]) -> str:
     lines = []
     for method in (method for method in METHODS if method in leads):
         found = [leads.loc[keep, method].dropna() for keep in keeps]
-        spans = [f"{f.mean():+.2f} ({f.min():+.2f} to {f.max():+.2f}), {len(f)}" if len(f) else "-" for f in found]
-        lines += [[method, *spans]] if any(map(len, found)) else []
+        spans = [f"{f.mean():+.2f} ({f.min():+.2f}…{f.max():+.2f}), {len(f)}" if len(f) else "-" for f in found]
+        lines += [[method.removesuffix(TRAINED), *spans]] if any(map(len, found)) else []
     return markdown(["over", *(f"{percent(keep)}, captures" for keep in keeps)], lines)
 
 
