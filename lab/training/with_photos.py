@@ -53,10 +53,7 @@ WAYS: dict[str, list[str]] = {
 }
 """What users of the program give to make a run smaller, but for the run and the budget."""
 
-TRAINED = ", trained on"
-"""End of the names of ways whose scores training on photos follows."""
-
-SCORES = {"lightgaussian": f"LightGaussian{TRAINED}", "pup": f"PUP-3DGS{TRAINED}"}
+SCORES = {"lightgaussian": "LightGaussian", "pup": "PUP-3DGS"}
 """Scores of prune that training on photos follows, and the names of these ways."""
 
 METHODS = (DENSE, *WAYS, COMPACTED_LONG, *SCORES.values())
@@ -186,7 +183,7 @@ def scene_table(rows: list[Row]) -> str:
     found = {(row["method"], row["keep"]): row for row in rows if row["method"] != DENSE}
     keeps = sorted({keep for _, keep in found}, reverse=True)
     ways = sorted({method for method, _ in found}, key=METHODS.index)
-    lines = [[way.removesuffix(TRAINED), *(_cell(found.get((way, keep), {})) for keep in keeps)] for way in ways]
+    lines = [[way, *(_cell(found.get((way, keep), {})) for keep in keeps)] for way in ways]
     return markdown(["way", *map(percent, keeps)], lines)
 
 
@@ -208,7 +205,7 @@ def lead_table(rows: list[Row]) -> str:
     for method in (method for method in METHODS if method in leads):
         found = [leads.loc[keep, method].dropna() for keep in keeps]
         spans = [f"{f.mean():+.2f} ({f.min():+.2f}…{f.max():+.2f}), {len(f)}" if len(f) else "-" for f in found]
-        lines += [[method.removesuffix(TRAINED), *spans]] if any(map(len, found)) else []
+        lines += [[method, *spans]] if any(map(len, found)) else []
     return markdown(["over", *(f"{percent(keep)}, captures" for keep in keeps)], lines)
 
 

@@ -26,7 +26,7 @@ from pointsplat_ns.io.files import bytes_text
 from pointsplat_ns.io.formats import format_to_write
 from pointsplat_ns.io.formats.rounding import ROUNDING, rounding_for
 from pointsplat_ns.photos.examples import Photos, mean_psnr
-from pointsplat_ns.system.progress import Progress, silent
+from pointsplat_ns.system.progress import Progress, silent, within
 from pointsplat_ns.system.quantities import counted
 from pointsplat_ns.view_source import ViewSource
 
@@ -175,9 +175,8 @@ def compact_to_psnr(
         known = mean_psnr(dense.to(device), held_out, every)
 
     def measure(count: int) -> tuple[float, Compacted]:
-        size = f"size {next(numbers)}"
         asked = replace(request, prune=replace(request.prune, keep=count))
-        made = compact_scene(dense, asked, views, lambda what, share: progress(f"{size}: {what}", share), photos)
+        made = compact_scene(dense, asked, views, within(f"size {next(numbers)}", progress), photos)
         if made.interrupted:
             raise KeyboardInterrupt
         if kind.rounded is not None and (psnr := judge.psnr(made.scene)[0]) <= ROUNDING.best_psnr:

@@ -40,7 +40,7 @@ from pointsplat_ns.levels.tiles import TILESET, placed, write_tiles
 from pointsplat_ns.looking.content import content_box
 from pointsplat_ns.merging import merge_levels
 from pointsplat_ns.pruning import Keep, found_by_trying, need_usable, parse_keep, resolve_keep
-from pointsplat_ns.system.progress import Progress
+from pointsplat_ns.system.progress import Progress, within
 from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
@@ -313,14 +313,14 @@ def make_levels(
     start = time.perf_counter()
     for merged in merge_levels(cut.scene, counts, functools.partial(progress, "merging"), views.for_merging()):
         which, scene, repair = f"level {len(made)}", merged.scene, None
-        interrupted = any(level.repair is not None and level.repair.interrupted for level in made)
-        if comparison is not None and len(scene) < len(cut.scene) and not interrupted:
+        if comparison is not None and len(scene) < len(cut.scene):
             before = comparison.reference.closeness(scene.to(at_work.device))
             if before.psnr < math.inf:
-                report = functools.partial(_of_level, progress, which)
-                repair = repaired_stage(Stage("merge", scene, before), at_work, budget, comparison, views, report)
+                report, merge = within(which, progress), Stage("merge", scene, before)
+                repair = repaired_stage(merge, at_work, budget, comparison, views, report)
                 scene = repair.scene if repair.accepted else scene
                 notes = (*notes, f"{which}: {stage_text(repair)}")
+                comparison = None if repair.interrupted else comparison
         seconds = time.perf_counter() - start
         progress(f"judging {which} of {len(counts) - 1}", 0.0)
         quality = None if judge is None else judge.quality(scene)
@@ -328,7 +328,3 @@ def make_levels(
         made.append(Level(scene, merged.assignment, dropped, quality, seconds, repair))
         start = time.perf_counter()
     return Levels(dense, tuple(made), compared, views.origin, source, notes, judge)
-
-
-def _of_level(progress: Progress, which: str, what: str, share: float) -> None:
-    progress(f"{which}: {what}", share)

@@ -18,6 +18,11 @@ def silent(what: str, share: float) -> None:
     """Progress that is not shown."""
 
 
+def within(whole: str, progress: Progress) -> Progress:
+    """Progress of the tasks that are parts of another: their names come after its name."""
+    return lambda what, share: progress(f"{whole}: {what}", share)
+
+
 @contextmanager
 def progress_bar(progress: bool | Progress = True) -> Iterator[Progress]:
     """A bar in the terminal or notebook, with an estimate of the time left; it is erased at the end. Elsewhere, as in a
