@@ -17,10 +17,11 @@ from lab.common.programs import ProgramFailed, Usage, run_measured
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply
 
-Way = Literal["prune", "compact", "thorough"]
+Way = Literal["prune", "memory", "compact", "thorough"]
 
 WAYS: dict[Way, tuple[str, ...]] = {
     "prune": ("prune",),
+    "memory": ("prune", "--memory", "2GB"),
     "compact": ("compact",),
     "thorough": ("compact", "--effort", "thorough"),
 }

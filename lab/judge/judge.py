@@ -182,7 +182,7 @@ def main(
     Args:
         scenes: PLY files that have a camera path of their name, and Splatfacto runs, judged in their held-out photos.
         keep: shares of the Gaussians to keep.
-        ways: prune and compact as a user calls them, and thorough: compact with that effort.
+        ways: prune and compact as a user calls them; memory: prune in 2 GB; thorough: compact with that effort.
         splat_transform: programs, of any versions, each of whose modes is a way too.
         widths: of the pictures of camera paths, pixels; the height is 9/16 of it.
         views: at most so many views of each scene, evenly spread.
