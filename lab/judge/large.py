@@ -40,7 +40,7 @@ PAGE = f"""# Large scenes
 
 `lab/judge/large.py` measures these figures, and writes this page from [large.json](large.json).
 
-- PSNR in dB against renders of the whole scene, mean (worst) over the views of a camera path.
+- PSNR in dB against renders of the whole scene, mean/worst over the views of a camera path.
 - "x prune" is CPU time beside that of `{FIRST}`. They are of whole processes on one thread, with reading a PLY and
   writing one. The machine was busy: compare ratios. GB is the largest memory.
 """
@@ -84,7 +84,7 @@ def page(rows: list[Row]) -> str:
         for count, beside in sorted(grouped(same, lambda row: row["count"]).items(), reverse=True):
             first = next((row["cpu_seconds"] for row in beside if row["way"] == FIRST), None)
             for row in sorted(beside, key=_order):
-                quality = [f"{row[f'mean_{width}']:.1f} ({row[f'worst_{width}']:.1f})" for width in WIDTHS]
+                quality = [f"{row[f'mean_{width}']:.1f}/{row[f'worst_{width}']:.1f}" for width in WIDTHS]
                 way = " ".join(WAYS.get(row["way"], (row["way"],)))
                 lines.append([f"{count:,}", way, *quality, *_cost(row, first)])
         heads = ("Gaussians", "way", *(f"{width} pixels" for width in WIDTHS), f"x {FIRST}", "GB")

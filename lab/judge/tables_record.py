@@ -43,7 +43,7 @@ python -m lab.tables outputs/room35 outputs/phone outputs/can outputs/office -o 
     --scoring-views 12 --fine-tune 60 --refiners networks --groups captures=room35,phone,can,office
 ```
 
-- Cells are PSNR (dB) and LPIPS (AlexNet) against held-out photos: means over the captures.
+- Cells are PSNR (dB)/LPIPS (AlexNet) against held-out photos: means over the captures.
 - Scenes and sizes are not the paper's:
   {sizes}.
 - "made with": steps of fine-tuning, or encoder, size and steps of a network. Each network learned at the share of its
@@ -88,18 +88,18 @@ def shortened(table: Table) -> Table:
     rows = [dict(zip(table.header, row, strict=True)) for row in table.rows if "not measured" not in row]
     parts = [name for name in table.header if name not in (*LEFT_OUT, "PSNR", "LPIPS", "made with")]
     if table.number == 4:
-        header, lines = ["model", "parts", "PSNR, LPIPS"], []
+        header, lines = ["model", "parts", "PSNR/LPIPS"], []
         for row in rows:
             spread = "" if row["spread"] == "-" else f" ± {row['spread']}"
             used = ", ".join(name for name in parts[1:] if row[name])
-            lines.append([row["model"], used, f"{row['PSNR']}{spread}, {row['LPIPS']}"])
+            lines.append([row["model"], used, f"{row['PSNR']}{spread}/{row['LPIPS']}"])
         return dataclasses.replace(table, header=tuple(header), rows=[tuple(line) for line in lines], notes=[])
     found = {tuple(row[name] for name in parts): row for row in rows}
     columns, methods = (list(dict.fromkeys(words[place] for words in found)) for place in (0, 1))
     header, lines = [parts[1], *columns], []
     for method in methods:
         own = {column: found[column, method] for column in columns if (column, method) in found}
-        lines.append([method, *(f"{own[c]['PSNR']}, {own[c]['LPIPS']}" if c in own else "-" for c in columns)])
+        lines.append([method, *(f"{own[c]['PSNR']}/{own[c]['LPIPS']}" if c in own else "-" for c in columns)])
         if table.number == 1:  # networks of Table 3 are made like these
             lines[-1].append("; ".join(dict.fromkeys(row["made with"].partition(", keep")[0] for row in own.values())))
     header += ["made with"] * (table.number == 1)

@@ -28,7 +28,7 @@ PAGE = """# Time beside splat-transform
 
 `lab/speed/beside.py` measures these figures, and writes this page from [speed.json](speed.json).
 
-- A cell has CPU seconds of `pointsplat prune` / of splat-transform `--decimate`, then their ratio. They are of whole
+- A cell has CPU seconds of `pointsplat prune`/of splat-transform `--decimate`, and their ratio. They are of whole
   processes on one thread. The machine was busy: compare ratios.
 - MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours.
 - taebak_million is a random sample of a scene of 4.2 million.
@@ -55,7 +55,7 @@ def page(rows: list[Row]) -> str:
     scenes = grouped(rows, lambda row: (row["scene"], row["gaussians"], row["sh_degree"]))
     for (scene, count, degree), same in sorted(scenes.items(), key=lambda item: -item[0][1]):
         pairs = {keep: [row for row in same if row["keep"] == keep] for keep in keeps}
-        memory = " / ".join(f"{row['peak_bytes'] / 1e6:,.0f}" for row in pairs[min(row["keep"] for row in same)])
+        memory = "/".join(f"{row['peak_bytes'] / 1e6:,.0f}" for row in pairs[min(row["keep"] for row in same)])
         lines.append([f"{scene}, {count:,}, SH {degree}", *map(_cell, pairs.values()), memory])
     heads = ("scene, Gaussians", *(f"{keep:.0%}" for keep in keeps), "MB")
     return f"{PAGE}\n{markdown(heads, lines)}\n"
@@ -66,7 +66,7 @@ def _cell(pair: list[Row]) -> str:
     if not pair:
         return ""
     ours, theirs = (next(row["cpu_seconds"] for row in pair if (row["method"] == OURS) is own) for own in (True, False))
-    return f"{ours:.1f} / {theirs:.1f}: {ours / theirs:.2f}"
+    return f"{ours:.1f}/{theirs:.1f}={ours / theirs:.2f}"
 
 
 def main(

@@ -9,7 +9,7 @@ import torch
 
 import pointsplat_ns as ps
 from lab.common.programs import Usage, run_measured
-from lab.judge import ablation, camera_paths, cleaning, judge, levels, record, refiners, scenes
+from lab.judge import ablation, camera_paths, cleaning, judge, large, record, refiners, scenes
 from lab.judge import bytes as equal_bytes
 from making import box_room, move_zero_layers, run_of
 from peers import peer
@@ -106,14 +106,17 @@ def test_means_and_leads_are_over_scenes_that_have_every_way():
     assert figures.scenes(960) == "2" and row in text
 
 
-def test_levels_of_a_stream_are_judged_beside_merges_of_their_counts(small, tmp_path, capsys):
+def test_levels_of_a_stream_are_judged_beside_programs_at_their_counts(small, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(large, "WIDTHS", (32, 64))
     ps.lod(small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48))
-    results = tmp_path / "levels.json"
-    levels.main(tmp_path / "stream" / "lod-meta.json", "small", widths=(32, 64), json_path=results)
-    rows = json.loads(results.read_text())
-    assert [(row["way"], row["count"]) for row in rows] == [(w, n) for w in ("its level", "prune") for n in (360, 180)]
-    assert all(row["worst_64"] < row["mean_64"] < 60 for row in rows)
-    assert "900 Gaussians" in capsys.readouterr().out
+    results, programs = tmp_path / "l.json", dict(ways=("prune",), splat_transform=(peer(tmp_path, "2.0"),))
+    for counts in ((360,), ()):  # what is there is not measured again
+        large.main(tmp_path / "stream/lod-meta.json", "small", counts, json_path=results, resume=True, **programs)
+    rows = rows_of(results)
+    found = sorted((row["way"][:5], row["count"]) for row in rows)
+    assert found == [(way, count) for way in ("prune", "publi", "splat") for count in (180, 360)]
+    assert all(row["worst_64"] < row["mean_64"] < 60 and row["kept"] == row["count"] for row in rows)
+    assert "900 Gaussians" in (said := capsys.readouterr().out) and "| 1.00 |" in said
 
 
 TWO = ("no_regrouping", "growth_0")

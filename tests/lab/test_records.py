@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from lab.judge import ablation, record, tables_record
+from lab.judge import ablation, large, record, tables_record
 from lab.judge.record import FOLDER as RECORD
 from lab.numerics import cases, report, stability
 from lab.speed import beside, rasterizer
@@ -21,6 +21,7 @@ PAGES = {
     "results.md": lambda: tables_record.page(tables_record.read(RECORD / "results.json"), RECORD / "encoders.json"),
     "speed.md": lambda: beside.page(json.loads((RECORD / "speed.json").read_text("utf-8"))["rows"]),
     "ablation.md": lambda: ablation.page(*record.read([RECORD / "ablation.json"], "ablation.py")),
+    "large.md": lambda: large.page(json.loads((RECORD / "large.json").read_text("utf-8"))["rows"]),
     "judge.md": lambda: record.page(*record.read(JUDGED)),
 }
 
@@ -48,7 +49,7 @@ def test_both_programs_are_timed_at_each_budget_and_what_is_there_is_kept(monkey
     assert [(row["keep"], row["method"] == beside.OURS) for row in rows] == [(0.5, True), (0.5, False)]
     assert all(row["cpu_seconds"] > 0 and row["peak_bytes"] > 1e6 and row["gaussians"] == 300 for row in rows)
     first = rows[0]["cpu_seconds"], rows[1]["cpu_seconds"]
-    assert f"{first[0]:.1f} / {first[1]:.1f}: {first[0] / first[1]:.2f}" in capsys.readouterr().out
+    assert f"{first[0]:.1f}/{first[1]:.1f}={first[0] / first[1]:.2f}" in capsys.readouterr().out
     monkeypatch.setattr(beside, "rows_of", lambda *_: pytest.fail("measured again"))
     beside.main((tmp_path / "room.ply",), **arguments)
 
