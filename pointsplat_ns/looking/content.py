@@ -82,15 +82,15 @@ def thinning(count: int, max_count: int) -> int:
 def thinned(scene: Gaussians, max_count: int) -> Gaussians:
     """Every so many-th Gaussian, about ``max_count`` at most, enlarged so that they cover as much as all."""
     step = thinning(len(scene), max_count)
-    return _enlarged(scene[::step], step)
+    return enlarged(scene[::step], step)
 
 
 def every_nth(scene: Gaussians, members: Tensor, step: int) -> Gaussians:
     """Every ``step``-th of the Gaussians with indices ``members`` (n,), without SH, enlarged so that they cover as much
     as all members."""
-    return _enlarged(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
+    return enlarged(scene.replace(features_rest=scene.features_rest[:, :0])[members[::step]], step)
 
 
-def _enlarged(scene: Gaussians, step: int) -> Gaussians:
-    """Gaussians with ``step`` times the area."""
-    return scene.replace(scales=scene.scales + 0.5 * math.log(step))
+def enlarged(scene: Gaussians, times: float) -> Gaussians:
+    """Gaussians with so many times the area."""
+    return scene.replace(scales=scene.scales + 0.5 * math.log(times))

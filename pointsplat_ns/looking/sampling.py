@@ -94,6 +94,7 @@ class Sampler:
         scene: N Gaussians. A large one is thinned.
         resolution: width and height of the views, pixels.
         up: which way is up; by default the axis that the scene declares, or estimated.
+        stands_for: number of Gaussians of a larger scene for each, which was enlarged by that (:func:`enlarged`).
 
     Raises:
         DataError: if the resolution is not positive; and by attributes and methods, if nothing of the scene is visible.
@@ -104,11 +105,12 @@ class Sampler:
         scene: Gaussians,
         resolution: tuple[int, int] = RESOLUTION,
         up: Up | None = None,
+        stands_for: float = 1.0,
     ):
         if min(resolution) < 1:
             raise DataError(f"views of {resolution[0]} x {resolution[1]} pixels asked for; expected at least 1 x 1")
         self.scene = thinned(scene.detach(), LOOKING.sampled_count).to("cpu")  # many small operations
-        self._step = thinning(len(scene), LOOKING.sampled_count)
+        self._step = stands_for * thinning(len(scene), LOOKING.sampled_count)
         self.resolution, self._up = resolution, known_up(up, scene)
 
     @cached_property

@@ -13,7 +13,6 @@ cells.
 from __future__ import annotations
 
 import functools
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -28,7 +27,7 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply import PlyRows, header_bytes, ply_bytes, row_table
-from pointsplat_ns.looking.content import content_size
+from pointsplat_ns.looking.content import content_size, enlarged
 from pointsplat_ns.looking.sampling import Sampler
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
@@ -54,7 +53,7 @@ def merge_file(
     most: int,
     scratch: Scratch,
     views: Callable[[Gaussians], Views | None] = lambda sample: None,
-    sampler: Callable[[Gaussians], Sampler] = Sampler,
+    sampler: Callable[..., Sampler] = Sampler,
     progress: Progress = silent,
     settings: MergeSettings = MERGING,
     jobs: int = 1,
@@ -68,7 +67,7 @@ def merge_file(
         most: largest number of Gaussians in a cell, about.
         scratch: where finished steps are kept.
         views: from every so many-th Gaussian to known views, or None for sampled ones.
-        sampler: from Gaussians of the scene to the sampler of their views.
+        sampler: from Gaussians of the scene, and how many each ``stands_for``, to the sampler of their views.
         progress: called with what is being done, and the share done of it.
         settings: the tuned numbers.
         jobs: number of processes that share the cells. The result is the same to the bit.
@@ -90,8 +89,10 @@ def merge_file(
 
     def look() -> dict[str, Tensor]:
         progress("looking for views", 0.0)
+        stands_for = cells.count / len(cells.sample)
+        scene = enlarged(cells.sample, stands_for)  # they cover as much as all
         with one_thread_each():
-            return vars(overview_of(cells, views(cells.sample) or sampler(cells.sample), settings))
+            return vars(overview_of(cells, scene, views(scene) or sampler(scene, stands_for=stands_for), settings))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     with Workers(work, jobs) as workers:
@@ -130,10 +131,9 @@ class Overview:
     axes: Tensor  # [3 (d+1)^2, C]
 
 
-def overview_of(cells: Cells, views: Views | Sampler, settings: MergeSettings) -> Overview:
-    """The overview of a scene; ``views`` as for :func:`~pointsplat_ns.merging.merge`."""
-    share = cells.count / len(cells.sample)
-    scene = cells.sample.replace(scales=cells.sample.scales + 0.5 * math.log(share))  # they cover as much as all
+def overview_of(cells: Cells, scene: Gaussians, views: Views | Sampler, settings: MergeSettings) -> Overview:
+    """The overview of a scene, by the enlarged Gaussians of its sample; ``views`` as for
+    :func:`~pointsplat_ns.merging.merge`."""
     members = drawable(scene, 1)
     participants = Participants(scene, members, *content_size(scene))
     _, weights = views_and_weights(participants, views, settings)
@@ -149,7 +149,7 @@ class _Work:
     cells: Cells
     overview: Overview
     k: int
-    sampler: Callable[[Gaussians], Sampler]
+    sampler: Callable[..., Sampler]
     settings: MergeSettings
 
     def __call__(self, step: tuple[Any, ...]) -> None:

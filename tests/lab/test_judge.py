@@ -109,7 +109,7 @@ def test_means_and_leads_are_over_scenes_that_have_every_way():
 def test_levels_of_a_stream_are_judged_beside_programs_at_their_counts(small, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(large, "WIDTHS", (32, 64))
     ps.lod(small, ["100%", "40%", "20%"], folder=tmp_path / "stream", stream=True, resolution=(64, 48))
-    results, programs = tmp_path / "l.json", dict(ways=("prune",), splat_transform=(peer(tmp_path, "2.0"),))
+    results, programs = tmp_path / "l.json", dict(ways=("prune",), splat_transform=peer(tmp_path, "3.0"))
     for counts in ((360,), ()):  # what is there is not measured again
         large.main(tmp_path / "stream/lod-meta.json", "small", counts, json_path=results, resume=True, **programs)
     rows = rows_of(results)

@@ -11,7 +11,7 @@ from making import ball, box_room, splats
 from pointsplat_ns.errors import DataError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.looking import sampling
-from pointsplat_ns.looking.content import UNITS, content_size, in_units, views_in_units
+from pointsplat_ns.looking.content import UNITS, content_size, enlarged, in_units, views_in_units
 from pointsplat_ns.looking.poses import look_at, views_of
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
@@ -128,9 +128,9 @@ def test_views_do_not_depend_on_the_unit_of_length(make, factor):
 def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it(monkeypatch):
     scene = box_room(0, 3000)
     whole = Sampler(scene).content
-    monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=700))
-    few = Sampler(scene, (64, 48))
-    assert len(few.scene) == 750 and len(few.views(3)) == 3
+    monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=600))
+    few, given = Sampler(scene, (64, 48)), Sampler(enlarged(scene[::5], 5), (64, 48), stands_for=5)
+    assert len(few.scene) == 600 and torch.equal(few.views(3).viewmats, given.views(3).viewmats)
     assert few.content[1] == pytest.approx(whole[1], rel=0.05)
 
 
