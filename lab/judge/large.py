@@ -19,7 +19,7 @@ import tyro
 
 from lab.common.printing import markdown, start
 from lab.common.results import Results, Row, grouped
-from lab.common.ways import WAYS, Reducer, Way, programs_of
+from lab.common.ways import PEER, WAYS, Reducer, Way, programs_of
 from lab.judge.camera_paths import path_of, views_of
 from lab.judge.scenes import DenseViews
 from pointsplat_ns.gaussians import Gaussians
@@ -40,10 +40,9 @@ PAGE = f"""# Large scenes
 
 `lab/judge/large.py` measures these figures, and writes this page from [large.json](large.json).
 
-- PSNR in dB against renders of the whole scene, mean/worst over the views of a camera path.
-- "x prune" is CPU time beside that of `{FIRST}`. They are of whole processes on one thread, with reading a PLY and
-  writing one. The machine was busy: compare ratios. GB is the largest memory.
-- splat-transform: `--decimate`. Its adaptive mode needs a GPU above 2.1 million Gaussians.
+- PSNR in dB against renders of the whole scene, mean/worst over a camera path.
+- "x {FIRST}" is CPU time beside that of `{FIRST}`, of whole processes on one thread. GB is the largest memory.
+- {PEER}: `--decimate`. Its adaptive mode needs a GPU above 2.1 million Gaussians.
 """
 
 
@@ -86,7 +85,7 @@ def page(rows: list[Row]) -> str:
             first = next((row["cpu_seconds"] for row in beside if row["way"] == FIRST), None)
             for row in sorted(beside, key=_order):
                 quality = [f"{row[f'mean_{width}']:.1f}/{row[f'worst_{width}']:.1f}" for width in WIDTHS]
-                way = " ".join(WAYS.get(row["way"], (row["way"],)))
+                way = PEER if row["way"].startswith(PEER) else " ".join(WAYS.get(row["way"], (row["way"],)))
                 lines.append([f"{count:,}", way, *quality, *_cost(row, first)])
         heads = ("Gaussians", "way", *(f"{width} pixels" for width in WIDTHS), f"x {FIRST}", "GB")
         parts.append(f"## {name}, {gaussians:,} Gaussians\n\n{markdown(heads, lines)}\n")

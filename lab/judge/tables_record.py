@@ -50,8 +50,8 @@ python -m lab.tables outputs/room35 outputs/phone outputs/can outputs/office -o 
   column, on the six captures that tune, against dense renders, by the loss rmse + 0.05 LPIPS, at twelve times the
   usual rates; those of Table 4 three times (± standard deviation).
 - The published trainings take 10,000 steps. After so few as here, rows II to V of Table 4 are above I and differ by no
-  more than their spread: it does not support that gating and position help. Nor do 690 steps, on the first three
-  captures: I 19.27, II 18.75 ± 0.22, III 18.91 ± 0.15, IV 18.81 ± 0.14, V 18.57 ± 0.22.
+  more than their spread: it does not support that gating and position help. Nor do 690 steps, on three captures:
+  I 19.27, II 18.75 ± 0.22, III 18.91 ± 0.15, IV 18.81 ± 0.14, V 18.57 ± 0.22.
 - \\*: nothing is fine-tuned or refined. "-" was not measured.
 - Measured on {machines}.
 """

@@ -31,7 +31,6 @@ PAGE = """# Time beside splat-transform
 - A cell has CPU seconds of `pointsplat prune`/of splat-transform `--decimate`, and their ratio. They are of whole
   processes on one thread. The machine was busy: compare ratios.
 - MB: largest memory of both processes at the smallest budget that was measured. Torch's libraries take 540 MB of ours.
-- taebak_million is a random sample of a scene of 4.2 million.
 """
 
 
