@@ -89,10 +89,11 @@ def merge_file(
 
     def look() -> dict[str, Tensor]:
         progress("looking for views", 0.0)
-        stands_for = cells.count / len(cells.sample)
-        scene = enlarged(cells.sample, stands_for)  # they cover as much as all
+        step = -(-cells.count // settings.max_count_drawn)
+        sample, keys = cells.thinned(step)
+        scene = enlarged(sample, step)  # they cover as much as all
         with one_thread_each():
-            return vars(overview_of(cells, scene, views(scene) or sampler(scene, stands_for=stands_for), settings))
+            return vars(overview_of(scene, keys, views(scene) or sampler(scene, stands_for=step), settings))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     with Workers(work, jobs) as workers:
@@ -131,15 +132,15 @@ class Overview:
     axes: Tensor  # [3 (d+1)^2, C]
 
 
-def overview_of(cells: Cells, scene: Gaussians, views: Views | Sampler, settings: MergeSettings) -> Overview:
-    """The overview of a scene, by the enlarged Gaussians of its sample; ``views`` as for
+def overview_of(scene: Gaussians, keys: Tensor, views: Views | Sampler, settings: MergeSettings) -> Overview:
+    """The overview by a thinned scene, with places on the curve; ``views`` as for
     :func:`~pointsplat_ns.merging.merge`."""
     members = drawable(scene, 1)
     participants = Participants(scene, members, *content_size(scene))
     _, weights = views_and_weights(participants, views, settings)
     axes = principal_axes(scene, members)
     size = torch.tensor(participants.size, **DOUBLES)
-    return Overview(participants.centre, size, cells.keys[members], weights, *axes)
+    return Overview(participants.centre, size, keys[members], weights, *axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +193,7 @@ class _Work:
             participants = self.participants(cell)
             scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
             places = self.cells.keys_of(participants.scene)[participants.members]
-            nearest = torch.searchsorted(overview.keys, places).clamp_max_(len(overview.keys) - 1)
+            nearest = torch.searchsorted(overview.keys, places, right=True).sub_(1).clamp_min_(0)
             state = initial_state(participants, overview.weights[nearest], (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
         before = scratch.known(_round(number - 1, cell))

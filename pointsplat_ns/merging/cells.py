@@ -101,8 +101,7 @@ class Cells:
     """A scene in cells."""
 
     scratch: Scratch
-    sample: Gaussians  # [m] every so many-th Gaussian of the file, along the curve
-    keys: Tensor  # [m] int64, of the sample on the curve, ascending
+    sample: Gaussians  # [m] every so many-th Gaussian of the file
     cube: Cube
     """What the curve fills."""
     counts: tuple[int, ...]
@@ -131,6 +130,18 @@ class Cells:
                 for (_, into), values in zip(scene.items(), columns.split(widths, dim=1), strict=True):
                     into[start : start + count] = values.reshape(count, *into.shape[1:])
         return scene
+
+    def thinned(self, step: int) -> tuple[Gaussians, Tensor]:
+        """Every so many-th Gaussian of each cell along the curve, and their places on it (m,) int64, ascending. A
+        sample of the file would have holes through which what is hidden shows."""
+        parts, places = [], []
+        for cell in range(len(self)):
+            scene = self.read(cell)
+            keys, order = self.keys_of(scene).sort(stable=True)
+            parts.append(scene[order[::step]])
+            places.append(keys[::step])
+        keys, order = torch.cat(places).sort(stable=True)  # borders may part Gaussians of nearly one place
+        return Gaussians.cat(parts)[order], keys
 
     def keys_of(self, scene: Gaussians) -> Tensor:
         """Places (n,) int64 of Gaussians on the curve."""
@@ -187,8 +198,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         return {"counts": counts}
 
     counts = scratch.tensors("counts", write)["counts"]
-    order = keys.argsort(stable=True)
-    return Cells(scratch, some[order], keys[order], cube, tuple(counts.tolist()))
+    return Cells(scratch, some, cube, tuple(counts.tolist()))
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:

@@ -26,9 +26,7 @@ from pointsplat_ns.merging.cells import Scratch, divided
 def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
     folder.mkdir(exist_ok=True)
     write_ply(scene, folder / "scene.ply")
-    rows = PlyRows.open(folder / "scene.ply")
-    assert rows is not None
-    return rows
+    return PlyRows.open(folder / "scene.ply")
 
 
 BLIND = replace(MERGING, min_count_rendered=10**9)
@@ -46,8 +44,7 @@ def merged(rows: PlyRows, k: int, most: int, folder: Path, settings: MergeSettin
 @pytest.mark.parametrize("k", [5, 1499])
 def test_the_count_is_exact_for_any_budget_and_number_of_cells(k, tmp_path):
     rows = rows_of(cloud(1500, seed=4, sh_degree=1), tmp_path)
-    for most in (5000, 350):
-        assert len(merged(rows, k, most, tmp_path)) == k
+    assert all(len(merged(rows, k, most, tmp_path)) == k for most in (5000, 350))
 
 
 def test_fewer_gaussians_than_cells_are_refused(tmp_path):
@@ -71,6 +68,9 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
     read = Gaussians.cat([cells.read(cell) for cell in range(len(cells))])
     order, wanted = (s.features_dc.double().sum(1).argsort() for s in (read, scene))
     assert same_bits(read[order], scene[wanted])
+    few, keys = cells.thinned(4)
+    assert len(few) == sum(-(-count // 4) for count in cells.counts) and torch.equal(keys, keys.sort().values)
+    assert torch.equal(keys, cells.keys_of(few))
 
 
 @pytest.mark.usefixtures("usual_looking")
