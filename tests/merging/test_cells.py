@@ -137,7 +137,7 @@ for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for 
     start_of_peak()
     peaks.append(status_bytes("VmHWM"))
     rows = PlyRows.open(folder / "scene.ply")
-    blind = replace(MERGING, min_count_rendered=10**9)
+    blind = replace(MERGING, min_count_rendered=10**9, max_count_drawn=cells.OVERVIEW)
     merge_file(rows, lambda n: n // 10, folder / "small.ply", most, cells.Scratch(folder / "cells", {}), settings=blind)
     peaks.append(status_bytes("VmHWM"))
 print(peaks[3] - peaks[2])
