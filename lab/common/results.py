@@ -27,6 +27,12 @@ def write_json(path: Path | None, content: Any) -> None:
             part.write_text(json_text(content) + "\n", "utf-8")
 
 
+def write_page(rows: Path, page: Callable[[list[Row]], str]) -> None:
+    """Write the page of the rows in a file of :class:`Results`, under its name and beside it."""
+    with replacing(rows.with_suffix(".md")) as part:
+        part.write_text(page(json.loads(rows.read_text("utf-8"))["rows"]), "utf-8")
+
+
 class Results:
     """The rows of all scenes, in a file that is written anew after each.
 

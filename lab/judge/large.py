@@ -10,21 +10,20 @@ The last writes ``docs/record/large.md``. A streamed SOG is compared by its fine
 
 from __future__ import annotations
 
-import json
 import tempfile
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated
 
 import tyro
 
 from lab.common.printing import markdown, start
-from lab.common.results import Results, Row, grouped
+from lab.common.results import Results, Row, grouped, write_page
 from lab.common.ways import PEER, WAYS, Reducer, Way, programs_of
 from lab.judge.camera_paths import path_of, views_of
 from lab.judge.scenes import DenseViews
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_scene, write_ply
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.formats.sog_stream import coarser_levels
 
 PUBLISHED = "publisher's level"
@@ -56,7 +55,7 @@ def rows_of(scene: Path, name: str, counts: tuple[int, ...], programs: list[Redu
         row: Row = {"scene": name, "gaussians": len(whole), "count": count, "way": way, "kept": len(small), **cost}
         for width, judge in judges.items():
             psnrs = judge.psnrs(small)
-            row |= {f"mean_{width}": sum(psnrs) / len(psnrs), f"worst_{width}": min(psnrs)}
+            row |= {f"mean_{width}": fmean(psnrs), f"worst_{width}": min(psnrs)}
         print(row, flush=True)
         results.put(name, [*results.of(name), row])
 
@@ -132,8 +131,7 @@ def main(
         write: rows as JSON; a page of the same name is written beside.
     """
     if write is not None:
-        with replacing(write.with_suffix(".md")) as part:
-            part.write_text(page(json.loads(write.read_text("utf-8"))["rows"]), "utf-8")
+        write_page(write, page)
         return
     if scene is None or (not counts and scene.suffix == ".ply"):
         raise SystemExit("expected a streamed SOG, or a PLY and --counts")

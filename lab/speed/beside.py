@@ -10,16 +10,14 @@ turns, so that a busy machine slows both alike.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from lab.common.printing import markdown, start
-from lab.common.results import Results, Row, grouped
+from lab.common.results import Results, Row, grouped, write_page
 from lab.common.ways import count_of, programs_of
-from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply import PlyRows
 
 OURS = "prune"
@@ -87,9 +85,7 @@ def main(
         write: rows as JSON; speed.md is written beside.
     """
     if write is not None:
-        rows = json.loads(write.read_text("utf-8"))["rows"]
-        with replacing(write.with_suffix(".md")) as part:
-            part.write_text(page(rows), "utf-8")
+        write_page(write, page)
         return
     results = Results(json_path, {}, resume)
     for source in scenes:

@@ -89,10 +89,11 @@ def merge_file(
 
     def look() -> dict[str, Tensor]:
         progress("looking for views", 0.0)
-        step = -(-cells.count // settings.max_count_drawn)
-        sample, keys = cells.thinned(step)
-        scene = enlarged(sample, step)  # they cover as much as all
+        # each cell gives one more at most, and the overview must not be thinned again
+        step = -(-cells.count // max(1, settings.max_count_drawn - len(cells)))
         with one_thread_each():
+            sample, keys = cells.thinned(step)
+            scene = enlarged(sample, step)  # they cover as much as all
             return vars(overview_of(scene, keys, views(scene) or sampler(scene, stands_for=step), settings))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)

@@ -27,8 +27,8 @@ from pointsplat_ns.system.tensors import INDICES
 ROWS_AT_ONCE = 1 << 17
 """Number of rows that are read at once."""
 
-OVERVIEW = 1 << 18
-"""Number of Gaussians of the thinned scene, about as many as are drawn to count covered pixels."""
+SAMPLED = 1 << 18
+"""Largest number of Gaussians by which the borders of cells are found."""
 
 
 class Scratch:
@@ -101,7 +101,7 @@ class Cells:
     """A scene in cells."""
 
     scratch: Scratch
-    sample: Gaussians  # [m] every so many-th Gaussian of the file
+    kind: Gaussians  # [0] with the widths and the traits of all
     cube: Cube
     """What the curve fills."""
     counts: tuple[int, ...]
@@ -118,8 +118,8 @@ class Cells:
     def read(self, cell: int) -> Gaussians:
         """The Gaussians of a cell, in the order of the file."""
         path = self.scratch.folder / _name(cell)
-        widths = [values[:0].flatten(1).shape[1] for values in self.sample.tensors()]
-        scene = self.sample.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
+        widths = [values.flatten(1).shape[1] for values in self.kind.tensors()]
+        scene = self.kind.map(lambda values: values.new_empty(self.counts[cell], *values.shape[1:]))
         with path.open("rb") as stream:
             for start in range(0, len(scene), ROWS_AT_ONCE):
                 count = min(ROWS_AT_ONCE, len(scene) - start)
@@ -160,7 +160,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
     Raises:
         SceneError: if the file cannot be read, or no Gaussian of the sample can be drawn.
     """
-    picked = range(0, rows.count, -(-rows.count // OVERVIEW))
+    picked = range(0, rows.count, -(-rows.count // SAMPLED))
     some = rows.pick(picked)
     usable = some.usable()
     if not bool(usable.any()):
@@ -198,7 +198,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         return {"counts": counts}
 
     counts = scratch.tensors("counts", write)["counts"]
-    return Cells(scratch, some, cube, tuple(counts.tolist()))
+    return Cells(scratch, some[:0], cube, tuple(counts.tolist()))
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:

@@ -39,14 +39,19 @@ def replica(folder: Path, name: str, size: tuple[int, int] = (1200, 680), frames
     (scene / "traj.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * frames)
     camera = {"w": size[0], "h": size[1], "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
     (scene / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    parser = "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig"
-    return SimpleNamespace(data=scene, dataparser_class=parser)
+    return run(scene, "pointsplat_ns.nerfstudio_plugin.replica.dataparser.ReplicaDataParserConfig")
+
+
+def run(data: Path, parser: str) -> SimpleNamespace:
+    return SimpleNamespace(data=data, dataparser_class=parser)
 
 
 def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path):
     assert paper_dataset(replica(tmp_path, "office2")) == "Replica"
+    assert paper_dataset(replica(tmp_path, "kitchen", frames=3)) == ""
     assert paper_dataset(replica(tmp_path / "few", "office2", frames=3)) == ""
-    assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""  # rooms of the lab
+    # Drawn rooms are of the same layout and may be called the same.
+    assert paper_dataset(replica(tmp_path / "made", "room0", (320, 240), frames=80)) == ""
 
 
 @pytest.mark.parametrize(
@@ -61,8 +66,7 @@ def test_the_papers_replica_is_known_by_name_size_and_number_of_photos(tmp_path)
 )
 def test_scannetpp_is_known_by_the_names_of_its_scenes(scene, below, parser, dataset, tmp_path):
     (tmp_path / scene / "dslr" / "colmap").mkdir(parents=True)
-    parser = f"nerfstudio.data.dataparsers.{parser}"
-    assert paper_dataset(SimpleNamespace(data=tmp_path / scene / below, dataparser_class=parser)) == dataset
+    assert paper_dataset(run(tmp_path / scene / below, f"nerfstudio.data.dataparsers.{parser}")) == dataset
 
 
 @pytest.mark.parametrize(

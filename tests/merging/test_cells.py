@@ -129,7 +129,7 @@ from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.settings import MERGING
 from lab.common.timing import start_of_peak, status_bytes
 from pointsplat_ns.system.memory import give_back_freed_memory
-cells.ROWS_AT_ONCE, cells.OVERVIEW = 1 << 13, 1 << 12
+cells.ROWS_AT_ONCE, cells.SAMPLED = 1 << 13, 1 << 12
 peaks = []
 for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for imports and kernels
     folder = Path(sys.argv[1]) / name
@@ -137,7 +137,7 @@ for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for 
     start_of_peak()
     peaks.append(status_bytes("VmHWM"))
     rows = PlyRows.open(folder / "scene.ply")
-    blind = replace(MERGING, min_count_rendered=10**9, max_count_drawn=cells.OVERVIEW)
+    blind = replace(MERGING, min_count_rendered=10**9, max_count_drawn=cells.SAMPLED)
     merge_file(rows, lambda n: n // 10, folder / "small.ply", most, cells.Scratch(folder / "cells", {}), settings=blind)
     peaks.append(status_bytes("VmHWM"))
 print(peaks[3] - peaks[2])

@@ -9,13 +9,7 @@ import torch.nn.functional as F
 from making import move_zero_layers, normal_scene
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.refiner import Refiner, preset, sparse_ops
-from pointsplat_ns.refiner.network import (
-    BatchNorm,
-    Block,
-    PatchAttention,
-    SceneNorm,
-    SubmanifoldConv,
-)
+from pointsplat_ns.refiner.network import BatchNorm, Block, PatchAttention, SceneNorm, SubmanifoldConv
 from pointsplat_ns.refiner.refiner import canonical_quats, gaussian_features
 from pointsplat_ns.refiner.sparse_ops import by_patches, permute, segment_max, segment_mean, submanifold_conv
 from pointsplat_ns.refiner.structure import build_structure, neighbour_pairs, unit_cube
