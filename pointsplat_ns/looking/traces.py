@@ -31,20 +31,35 @@ MIN_SH = 1e-4
 def trace_factors(scene: Gaussians, members: Tensor) -> Tensor:
     """Trace factor of each member: large where photos showed its neighbourhood well, 1 for the median member.
 
-    The mean energy of the SH and the exponential of the mean flatness, each to a power.
+    Args:
+        scene, members: as for :func:`traces_around`.
+
+    Returns:
+        (n,) float32, see :func:`factors_of`.
+    """
+    return factors_of(*traces_around(scene, members))
+
+
+def traces_around(scene: Gaussians, members: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean energy of the SH and mean flatness of the neighbourhood of each member.
 
     Args:
         scene: N Gaussians.
         members: (n,) indices, n at least 1, in an order in which neighbours are near each other.
 
     Returns:
-        (n,) float32; 1 for all if the Gaussians have no SH and are equally flat.
+        (n,) each, float64.
     """
     energies = in_pieces(lambda rows: _energy(scene.features_rest[rows].double()), members)
     flatnesses = in_pieces(lambda rows: _flatness(scene.scales[rows].double()), members)
     energy, flatness = (means_around(values, LOOKING.trace_neighbourhood) for values in (energies, flatnesses))
-    exponent = LOOKING.flatness_exponent * (1 if bool((energy > 0).any()) else 2)
-    logs = LOOKING.energy_exponent * (energy + MIN_SH**2).log() + exponent * flatness
+    return energy, flatness
+
+
+def factors_of(energy: Tensor, flatness: Tensor) -> Tensor:
+    """The mean energy (n,) and the exponential of the mean flatness (n,), each to a power, relative to the median, (n,)
+    float32; 1 for all if all are equal."""
+    logs = LOOKING.energy_exponent * (energy + MIN_SH**2).log() + LOOKING.flatness_exponent * flatness
     return (logs - logs.median()).clamp(-LOOKING.max_log_factor, LOOKING.max_log_factor).exp().float()
 
 
@@ -74,7 +89,7 @@ class PhotoTraces:
     shares: Tensor
     """(P,) of the photos, which sum to 1."""
     sure: bool
-    """Whether the best place explains enough for photos to have been taken there."""
+    """Whether SH explain enough at the best place for photos to have been taken there."""
 
     def __init__(self, scene: Gaussians):
         generator, count = torch.Generator().manual_seed(0), LOOKING.evidence_count
@@ -96,7 +111,7 @@ class PhotoTraces:
         best = float(found.max())
         shares = (found.clamp_min(0) / max(best, 1e-9)) ** LOOKING.photo_share_exponent + 1e-12
         self.shares = shares / shares.sum()
-        self.sure = best >= (LOOKING.min_sh_evidence if self.has_sh else LOOKING.min_size_evidence)
+        self.sure = self.has_sh and best >= LOOKING.min_sh_evidence
 
     def evidence(self, places: Tensor) -> Tensor:
         """Evidence for each place (P, 3), (P,) float32: the mean of the :func:`explained_energy`; without SH, the

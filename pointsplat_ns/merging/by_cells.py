@@ -1,7 +1,8 @@
 """Merging of scenes that are larger than memory: cell by cell, with files in between.
 
 1. Parts of the curve with equally many Gaussians are the **cells**; each gets a file of its own (``cells.py``).
-2. An evenly thinned scene gives views, visibility weights and axes of colours: the overview.
+2. Thinned scenes give views, visibility weights and axes of colours: the overview. Views and weights are those of
+   merging in memory.
 3. A round finds pairs in each cell. The cheapest of all cells are merged: one price holds everywhere, and the count is
    exact.
 4. In each cell, members are regrouped, and their rows are written.
@@ -27,8 +28,10 @@ from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.neighbours import other_neighbours
 from pointsplat_ns.io.files import replacing
 from pointsplat_ns.io.ply import PlyRows, header_bytes, ply_bytes, row_table
-from pointsplat_ns.looking.content import content_size, enlarged
+from pointsplat_ns.looking.content import content_size, enlarged, thinning
 from pointsplat_ns.looking.sampling import Sampler
+from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.looking.traces import factors_of, traces_around
 from pointsplat_ns.merging.cells import Cells, Scratch, divided
 from pointsplat_ns.merging.groups import Groups, scene_maker
 from pointsplat_ns.merging.pair_cost import pair_costs
@@ -36,8 +39,8 @@ from pointsplat_ns.merging.pairs import Round, cheapest_pairs, replace_pairs
 from pointsplat_ns.merging.regrouping import regrouped
 from pointsplat_ns.merging.rounds import merge, most_pairs
 from pointsplat_ns.merging.settings import MERGING, MergeSettings
-from pointsplat_ns.merging.state import Participants, State, drawable, initial_state, principal_axes
-from pointsplat_ns.merging.visibility import views_and_weights
+from pointsplat_ns.merging.state import Participants, State, initial_state, principal_axes
+from pointsplat_ns.merging.visibility import drawn_step, views_to_weigh, visibility_weights
 from pointsplat_ns.system.progress import Progress, silent
 from pointsplat_ns.system.tensors import DOUBLES, FLOATS, INDICES
 from pointsplat_ns.system.threads import one_thread_each
@@ -89,12 +92,11 @@ def merge_file(
 
     def look() -> dict[str, Tensor]:
         progress("looking for views", 0.0)
-        # each cell gives one more at most, and the overview must not be thinned again
-        step = -(-cells.count // max(1, settings.max_count_drawn - len(cells)))
+        step = thinning(rows.count, LOOKING.sampled_count)
+        some = enlarged(rows.pick(range(0, rows.count, step)), step)  # they cover as much as all
         with one_thread_each():
-            sample, keys = cells.thinned(step)
-            scene = enlarged(sample, step)  # they cover as much as all
-            return vars(overview_of(scene, keys, views(scene) or sampler(scene, stands_for=step), settings))
+            seen = views_to_weigh(cells.starts(k)[-1], views(some) or sampler(some, stands_for=step), settings)
+            return vars(overview_of(cells, k, *seen, settings))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     with Workers(work, jobs) as workers:
@@ -127,21 +129,32 @@ class Overview:
 
     centre: Tensor  # [3] float64, of the content
     size: Tensor  # scalar float64, diagonal of the content, scene units
-    keys: Tensor  # [m] int64, ascending places on the curve
-    weights: Tensor  # [m] float32, visibility weights there
+    weights: Tensor  # [m] float32, visibility weights of every ``step``-th member of all cells, along the curve
+    step: Tensor  # scalar int64
     middle: Tensor  # [3 (d+1)^2] as of principal_axes
     axes: Tensor  # [3 (d+1)^2, C]
 
 
-def overview_of(scene: Gaussians, keys: Tensor, views: Views | Sampler, settings: MergeSettings) -> Overview:
-    """The overview by a thinned scene, with places on the curve; ``views`` as for
-    :func:`~pointsplat_ns.merging.merge`."""
-    members = drawable(scene, 1)
-    participants = Participants(scene, members, *content_size(scene))
-    _, weights = views_and_weights(participants, views, settings)
-    axes = principal_axes(scene, members)
-    size = torch.tensor(participants.size, **DOUBLES)
-    return Overview(participants.centre, size, keys[members], weights, *axes)
+def overview_of(cells: Cells, k: int, views: Views | None, traced: bool, settings: MergeSettings) -> Overview:
+    """The overview of cells that become ``k`` Gaussians, with views of :func:`views_to_weigh`, and whether trace
+    factors count. Every so many-th member of all is drawn: a sample of the file would have holes, through which what is
+    hidden shows."""
+    *starts, count = cells.starts(k)
+    step = drawn_step(count, settings)
+    parts, traces = [], []
+    for cell, start in enumerate(starts):
+        scene, members = cells.members(cell, k)
+        here = slice(-start % step, None, step)
+        parts.append(scene[members[here]])
+        if traced:
+            traces.append(torch.stack(traces_around(scene, members))[:, here])
+    scene = enlarged(Gaussians.cat(parts), step)
+    participants = Participants(scene, torch.arange(len(scene), **INDICES), *content_size(scene))
+    weights = visibility_weights(participants, views, settings)
+    if traced:
+        weights *= factors_of(*torch.cat(traces, dim=1))
+    size, every = torch.tensor(participants.size, **DOUBLES), torch.tensor(step, **INDICES)
+    return Overview(participants.centre, size, weights, every, *principal_axes(scene, participants.members))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +206,9 @@ class _Work:
         if number == 0:
             participants = self.participants(cell)
             scratch.make(_sizes(cell), functools.partial(self.size_changes, cell, participants))
-            places = self.cells.keys_of(participants.scene)[participants.members]
-            nearest = torch.searchsorted(overview.keys, places, right=True).sub_(1).clamp_min_(0)
-            state = initial_state(participants, overview.weights[nearest], (overview.middle, overview.axes))
+            places = torch.arange(len(participants), **INDICES) + self.cells.starts(self.k)[cell]
+            weights = overview.weights[places // overview.step]
+            state = initial_state(participants, weights, (overview.middle, overview.axes))
             return state, torch.arange(len(state), **INDICES)
         before = scratch.known(_round(number - 1, cell))
         chosen = scratch.known(_chosen(number - 1))[f"{cell}"]
@@ -206,10 +219,7 @@ class _Work:
 
     def participants(self, cell: int) -> Participants:
         """The participants of a cell, along the curve."""
-        scene = self.cells.read(cell)
-        members = drawable(scene, -(-len(scene) * self.k // self.cells.count))
-        order = self.cells.keys_of(scene)[members].argsort(stable=True)
-        return Participants(scene, members[order], self.overview.centre, float(self.overview.size))
+        return Participants(*self.cells.members(cell, self.k), self.overview.centre, float(self.overview.size))
 
     def size_changes(self, cell: int, participants: Participants) -> dict[str, Tensor]:
         """The finish of the parts in this cell, of four parts that are evenly spread over all cells.

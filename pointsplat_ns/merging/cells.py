@@ -5,6 +5,7 @@ Each cell has a file of its own, in a folder of finished steps.
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Callable, Mapping
@@ -22,13 +23,12 @@ from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_
 from pointsplat_ns.io.files import logger, one_line, read_text, require_space, write_json, write_tensors
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.usable import usable_part
+from pointsplat_ns.merging.state import SAMPLED, drawable
+from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.tensors import INDICES
 
 ROWS_AT_ONCE = 1 << 17
 """Number of rows that are read at once."""
-
-SAMPLED = 1 << 18
-"""Largest number of Gaussians by which the borders of cells are found."""
 
 
 class Scratch:
@@ -106,6 +106,8 @@ class Cells:
     """What the curve fills."""
     counts: tuple[int, ...]
     """Number of Gaussians in each cell."""
+    drawable: tuple[int, ...]
+    """Number of those that are not too faint to be drawn."""
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -131,21 +133,22 @@ class Cells:
                     into[start : start + count] = values.reshape(count, *into.shape[1:])
         return scene
 
-    def thinned(self, step: int) -> tuple[Gaussians, Tensor]:
-        """Every so many-th Gaussian of each cell along the curve, and their places on it (m,) int64, ascending. A
-        sample of the file would have holes through which what is hidden shows."""
-        parts, places = [], []
-        for cell in range(len(self)):
-            scene = self.read(cell)
-            keys, order = self.keys_of(scene).sort(stable=True)
-            parts.append(scene[order[::step]])
-            places.append(keys[::step])
-        keys, order = torch.cat(places).sort(stable=True)  # borders may part Gaussians of nearly one place
-        return Gaussians.cat(parts)[order], keys
+    def members(self, cell: int, k: int) -> tuple[Gaussians, Tensor]:
+        """The Gaussians of a cell, and the indices (n,) of those that are merged where all together become ``k``, along
+        the curve."""
+        scene = self.read(cell)
+        members = drawable(scene, self.share(cell, k))
+        keys = [curve_keys(unit_cells(scene.means[some], self.cube)) for some in members.split(ROWS_AT_ONCE)]
+        return scene, members[torch.cat(keys).argsort(stable=True)]
 
-    def keys_of(self, scene: Gaussians) -> Tensor:
-        """Places (n,) int64 of Gaussians on the curve."""
-        return torch.cat([curve_keys(unit_cells(means, self.cube)) for means in scene.means.split(ROWS_AT_ONCE)])
+    def starts(self, k: int) -> list[int]:
+        """How many members are in all cells before each, and in all."""
+        counts = (max(count, self.share(cell, k)) for cell, count in enumerate(self.drawable))
+        return [0, *itertools.accumulate(counts)]
+
+    def share(self, cell: int, k: int) -> int:
+        """The share of a cell in ``k`` Gaussians."""
+        return -(-self.counts[cell] * k // self.count)
 
 
 def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float], None]) -> Cells:
@@ -169,14 +172,14 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         )
     numbers = torch.tensor(picked, **INDICES)[usable]
     some = usable_part(some)
-    cube = bulk_cube(some.means)
+    cube = bulk_cube(some.means[drawable(some, 1)])
     keys = curve_keys(unit_cells(some.means, cube))
     places = _places(keys, numbers, rows.count).sort().values
     cells = -(-rows.count // most)
     borders = places[torch.arange(1, cells, **INDICES) * len(places) // cells]
 
     def write() -> dict[str, Tensor]:
-        counts = torch.zeros(cells, **INDICES)
+        counts, clear = torch.zeros(2, cells, **INDICES)
         with ExitStack() as stack:
             files = [stack.enter_context((scratch.folder / _name(cell)).open("wb")) for cell in range(cells)]
             for start in range(0, rows.count, ROWS_AT_ONCE):
@@ -188,6 +191,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
                 table = torch.cat([values.flatten(1) for values in piece.tensors()], dim=1)
                 sizes = torch.bincount(cell, minlength=cells)
                 counts += sizes
+                clear += torch.bincount(cell[piece.alphas >= ALPHA_MIN], minlength=cells)
                 parts = table[cell.argsort(stable=True)].split(sizes.tolist())
                 for file, part in zip(files, parts, strict=True):
                     part.numpy().astype("<f4", copy=False).tofile(file)
@@ -195,10 +199,10 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         dropped = rows.count - int(counts.sum())
         if dropped:
             logger.warning("%s: dropped %d of %d Gaussians with NaN or infinite values", rows.path, dropped, rows.count)
-        return {"counts": counts}
+        return {"counts": counts, "drawable": clear}
 
-    counts = scratch.tensors("counts", write)["counts"]
-    return Cells(scratch, some[:0], cube, tuple(counts.tolist()))
+    counts = scratch.tensors("counts", write)
+    return Cells(scratch, some[:0], cube, *(tuple(counts[name].tolist()) for name in ("counts", "drawable")))
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:

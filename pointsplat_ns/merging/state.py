@@ -11,13 +11,16 @@ from torch import Tensor
 from pointsplat_ns.errors import BudgetError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.geometry.harmonics import SH_C0
-from pointsplat_ns.geometry.transforms import curve_keys, unit_cells
+from pointsplat_ns.geometry.transforms import bulk_cube, curve_keys, unit_cells
 from pointsplat_ns.looking.content import content_size
 from pointsplat_ns.merging.covariance import covariances_of
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.pieces import in_pieces, pieces
 from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import in_turn
+
+SAMPLED = 1 << 18
+"""About the largest number of Gaussians by which the curve and the borders of cells are found: every so many-th."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,9 @@ class Participants:
     @classmethod
     def of(cls, scene: Gaussians, members: Tensor) -> Participants:
         """The participants ``members`` (n,) of a scene, on its device."""
-        order = curve_keys(unit_cells(scene.means[members])).argsort(stable=True)
+        some = members[members % -(-len(scene) // SAMPLED) == 0]
+        cube = bulk_cube(scene.means[some if len(some) else members])
+        order = curve_keys(unit_cells(scene.means[members], cube)).argsort(stable=True)
         return cls(scene, members[order], *content_size(scene))
 
     def __len__(self) -> int:

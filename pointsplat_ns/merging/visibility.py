@@ -36,36 +36,61 @@ def views_and_weights(
     settings: MergeSettings,
     report: Callable[[float], None] = lambda share: None,
 ) -> tuple[Views | None, Tensor]:
-    """The views that visibility is computed in, and the visibility weights (n,) of participants.
+    """The views that visibility is computed in, and the visibility weights (n,) of participants, with trace factors
+    where they count. Arguments are those of :func:`views_to_weigh` and :func:`visibility_weights`."""
+    found, traced = views_to_weigh(len(participants), views, settings)
+    report(0.6)
+    weights = visibility_weights(participants, found, settings, lambda share: report(0.6 + 0.4 * share))
+    return found, weights * trace_factors(participants.scene, participants.members) if traced else weights
+
+
+def views_to_weigh(count: int, views: Views | Sampler | None, settings: MergeSettings) -> tuple[Views | None, bool]:
+    """The views that visibility is computed in, and whether trace factors (:mod:`~pointsplat_ns.looking.traces`) count.
+
+    Args:
+        count: number of Gaussians that are merged.
+        views: known views, or the sampler of those that people may have taken.
+        settings: ``min_count_rendered``, ``sampled_views`` and ``view_seed``.
+
+    Returns:
+        No views for a small scene without known ones, if nothing is visible, or if no view is asked for.
+    """
+    if isinstance(views, Views):
+        return views, False
+    if views is not None and count >= settings.min_count_rendered:
+        with contextlib.suppress(DataError):
+            return views.views(settings.sampled_views, settings.view_seed), views.traced
+    return None, False
+
+
+def visibility_weights(
+    participants: Participants,
+    views: Views | None,
+    settings: MergeSettings,
+    report: Callable[[float], None] = lambda share: None,
+) -> Tensor:
+    """The visibility weights (n,) of participants, by one of every so many of them along the curve; 1 without views.
 
     Args:
         participants: n Gaussians.
-        views: known views, or the sampler of those that people may have taken, by default a new one.
-        settings: ``min_count_rendered``, ``sampled_views``, ``view_seed`` and those of the weights.
+        views: of their scene, in its unit.
+        settings: ``max_count_drawn`` and those of :func:`covered_per_area`.
         report: called with the share done.
-
-    Returns:
-        No views for a small scene without known ones, if nothing is visible, or if no view is asked for. Where traces
-        show where the scene's photos were taken, weights are multiplied by :mod:`~pointsplat_ns.looking.traces`.
     """
-    found, traced = (views if isinstance(views, Views) else None), False
-    if not isinstance(views, Views) and len(participants) >= settings.min_count_rendered:
-        sampler = views or Sampler(participants.scene)
-        with contextlib.suppress(DataError):
-            found = sampler.views(settings.sampled_views, settings.view_seed)
-            traced = sampler.traced
-    report(0.6)
     scene, members = participants.scene, participants.members
-    weights = torch.ones_like(members, dtype=torch.float32)
-    if found is not None:
-        step = -(-len(members) // settings.max_count_drawn)  # one of so many along the curve is drawn for all of them
-        rows = members if step == 1 else numbers(-(-len(members) // step), members.device)
-        unit = participants.centre, participants.size
-        drawn = in_units(scene if step == 1 else every_nth(scene, members, step), *unit)
-        looks = views_in_units(found, *unit)
-        each = covered_per_area(drawn, rows, looks, settings, lambda share: report(0.6 + 0.4 * share))
-        weights = each.repeat_interleave(step)[: len(members)]
-    return found, weights * trace_factors(scene, members) if traced else weights
+    if views is None:
+        return torch.ones_like(members, dtype=torch.float32)
+    step = drawn_step(len(members), settings)
+    rows = members if step == 1 else numbers(-(-len(members) // step), members.device)
+    unit = participants.centre, participants.size
+    drawn = in_units(scene if step == 1 else every_nth(scene, members, step), *unit)
+    each = covered_per_area(drawn, rows, views_in_units(views, *unit), settings, report)
+    return each.repeat_interleave(step)[: len(members)]
+
+
+def drawn_step(count: int, settings: MergeSettings) -> int:
+    """Of ``count`` Gaussians, one of so many along the curve is drawn for all of them."""
+    return -(-count // settings.max_count_drawn)
 
 
 def covered_per_area(
