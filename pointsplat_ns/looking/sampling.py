@@ -138,14 +138,14 @@ class Sampler:
 
     @property
     def traced(self) -> bool:
-        """Whether the scene tells where its photos were taken."""
-        return self._traces.sure
+        """Whether SH tell where the scene's photos were taken, so that trace factors count."""
+        return self._traces.has_sh and self._traces.sure
 
     @cached_property
     def up(self) -> Up:
         """Which way is up."""
         few = thinned(self._in_units, 20_000)  # with half as many, a published room stands on its head
-        return self._up or upright(few, self.surface, self.traced)
+        return self._up or upright(few, self.surface, self._traces.sure)
 
     @cached_property
     def few(self) -> Gaussians:

@@ -43,8 +43,13 @@ class LookingSettings:
     min_sh_evidence: float = 2.0
     """Smallest evidence of the best place by SH, explained energy relative to SH of random directions, for trace
     factors to count; infinity turns them off. Captures reach 3.3 to 3.7 at photo places. Scenes seen from all around
-    reach 1.2 to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB). Without SH they never count:
-    by sizes and flatness alone they cost a garden 0.7 to 1.0 dB, and gained a capture 0.4."""
+    reach 1.2 to 1.6, and their best places lie in wrong parts of them (-0.1 to -0.4 dB). Without SH trace factors never
+    count: by flatness alone they cost a garden 0.7 to 1.0 dB, and gained a capture 0.4."""
+
+    min_size_evidence: float = 0.48
+    """The same in scenes without SH, by the correlation of the logarithms of size and distance, for the scene to be a
+    capture (:func:`~pointsplat_ns.looking.upright.upright_axis`). Captures from outside reach 0.50 to 0.78, rooms,
+    where any free place will do, 0.23 to 0.46."""
 
     # Up (upright.py)
 

@@ -89,7 +89,7 @@ class PhotoTraces:
     shares: Tensor
     """(P,) of the photos, which sum to 1."""
     sure: bool
-    """Whether SH explain enough at the best place for photos to have been taken there."""
+    """Whether the best place explains enough for photos to have been taken there."""
 
     def __init__(self, scene: Gaussians):
         generator, count = torch.Generator().manual_seed(0), LOOKING.evidence_count
@@ -111,7 +111,7 @@ class PhotoTraces:
         best = float(found.max())
         shares = (found.clamp_min(0) / max(best, 1e-9)) ** LOOKING.photo_share_exponent + 1e-12
         self.shares = shares / shares.sum()
-        self.sure = self.has_sh and best >= LOOKING.min_sh_evidence
+        self.sure = best >= (LOOKING.min_sh_evidence if self.has_sh else LOOKING.min_size_evidence)
 
     def evidence(self, places: Tensor) -> Tensor:
         """Evidence for each place (P, 3), (P,) float32: the mean of the :func:`explained_energy`; without SH, the

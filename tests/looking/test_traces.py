@@ -14,7 +14,6 @@ from pointsplat_ns.looking.sampling import sample_views
 from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.looking.traces import PhotoTraces, correlation, trace_factors
 from pointsplat_ns.nerfstudio_plugin.dataset_views import dataset_views
-from pointsplat_ns.pruning import cut_sh
 from pointsplat_ns.view_source import ViewSource
 from pointsplat_ns.views import Views
 
@@ -91,7 +90,6 @@ def flattened(scene: Gaussians) -> Gaussians:
     [
         pytest.param(halves(2.0), 2**1.5, 0.05, id="SH energy to the power 3/4"),
         pytest.param(flattened(halves(1.0)), 3, 0.1, id="flatness"),
-        pytest.param(cut_sh(flattened(halves(1.0)), 0), 9, 0.2, id="flatness squared without SH"),
     ],
 )
 def test_trace_factors_grow_with(scene, ratio, tolerance):

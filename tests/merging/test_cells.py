@@ -10,17 +10,21 @@ import pytest
 import torch
 
 from lab.common.timing import start_of_peak
-from making import box_room, cloud, same_bits
+from making import box_room, cloud, photographed, same_bits
 from pointsplat_ns.comparing.closeness import DenseReference
 from pointsplat_ns.compression import prune_file
 from pointsplat_ns.errors import BudgetError, SceneError
 from pointsplat_ns.gaussians import Gaussians
 from pointsplat_ns.io import read_ply, write_ply
 from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
-from pointsplat_ns.looking.sampling import sample_views
-from pointsplat_ns.merging import MERGING, MergeSettings, merge
+from pointsplat_ns.looking import sampling
+from pointsplat_ns.looking.sampling import Sampler, sample_views
+from pointsplat_ns.looking.settings import LOOKING
+from pointsplat_ns.merging import MERGING, MergeSettings, cells, merge, state
 from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.cells import Scratch, divided
+from pointsplat_ns.merging.state import Participants, drawable
+from pointsplat_ns.merging.visibility import views_and_weights
 
 
 def rows_of(scene: Gaussians, folder: Path) -> PlyRows:
@@ -68,9 +72,21 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
     read = Gaussians.cat([cells.read(cell) for cell in range(len(cells))])
     order, wanted = (s.features_dc.double().sum(1).argsort() for s in (read, scene))
     assert same_bits(read[order], scene[wanted])
-    few, keys = cells.thinned(4)
-    assert len(few) == sum(-(-count // 4) for count in cells.counts) and torch.equal(keys, keys.sort().values)
-    assert torch.equal(keys, cells.keys_of(few))
+
+
+@pytest.mark.parametrize(("scene", "tolerance"), [(box_room(3, 4000), 0.02), (photographed(4000), 0.1)])
+def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_path, monkeypatch):
+    """A tolerance for the size of the content, and for the median of traces, both by a sample."""
+    scene.opacities[::7] = -9.0  # too faint
+    for module in (state, cells):
+        monkeypatch.setattr(module, "SAMPLED", 1 << 9)
+    monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=900))
+    settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
+    participants = Participants.of(scene, drawable(scene, 400))
+    views, weights = views_and_weights(participants, Sampler(scene), settings)
+    merged(rows_of(scene, tmp_path), 400, 900, tmp_path, settings)
+    overview = Scratch(tmp_path / "cells-400-900", {}).known("overview")
+    assert torch.allclose(overview["weights"].log(), weights[:: int(overview["step"])].log(), atol=tolerance)
 
 
 @pytest.mark.usefixtures("usual_looking")
