@@ -151,7 +151,7 @@ def prune_file(
     work = {
         "scene": str(rows.path.resolve()), "bytes": status.st_size, "changed": status.st_mtime_ns, "rest": rows.rest,
         "keep": str(request.keep), "most": most, "views": _digest(known), "resolution": list(resolution or RESOLUTION),
-        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING), "state": "float32",
+        "up": None if up is None else up.direction.tolist(), "settings": repr(MERGING), "version": 2,
     }  # fmt: skip
 
     def views(sample: Gaussians) -> Views | None:

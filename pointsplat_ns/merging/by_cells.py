@@ -91,12 +91,13 @@ def merge_file(
         )
 
     def look() -> dict[str, Tensor]:
-        progress("looking for views", 0.0)
+        report = functools.partial(progress, "looking for views")
+        report(0.0)
         step = thinning(rows.count, LOOKING.sampled_count)
         some = enlarged(rows.pick(range(0, rows.count, step)), step)  # they cover as much as all
         with one_thread_each():
             seen = views_to_weigh(cells.starts(k)[-1], views(some) or sampler(some, stands_for=step), settings)
-            return vars(overview_of(cells, k, *seen, settings))
+            return vars(overview_of(cells, k, *seen, settings, report))
 
     work = _Work(cells, Overview(**scratch.tensors("overview", look)), k, sampler, settings)
     with Workers(work, jobs) as workers:
@@ -135,7 +136,9 @@ class Overview:
     axes: Tensor  # [3 (d+1)^2, C]
 
 
-def overview_of(cells: Cells, k: int, views: Views | None, traced: bool, settings: MergeSettings) -> Overview:
+def overview_of(
+    cells: Cells, k: int, views: Views | None, traced: bool, settings: MergeSettings, report: Callable[[float], None]
+) -> Overview:
     """The overview of cells that become ``k`` Gaussians, with views of :func:`views_to_weigh`, and whether trace
     factors count. Every so many-th member of all is drawn: a sample of the file would have holes, through which what is
     hidden shows."""
@@ -148,9 +151,10 @@ def overview_of(cells: Cells, k: int, views: Views | None, traced: bool, setting
         parts.append(scene[members[here]])
         if traced:
             traces.append(torch.stack(traces_around(scene, members))[:, here])
+        report(0.5 * len(parts) / len(cells))
     scene = enlarged(Gaussians.cat(parts), step)
     participants = Participants(scene, torch.arange(len(scene), **INDICES), *content_size(scene))
-    weights = visibility_weights(participants, views, settings)
+    weights = visibility_weights(participants, views, settings, lambda share: report(0.5 + 0.5 * share))
     if traced:
         weights *= factors_of(*torch.cat(traces, dim=1))
     size, every = torch.tensor(participants.size, **DOUBLES), torch.tensor(step, **INDICES)
