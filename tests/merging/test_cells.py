@@ -82,8 +82,7 @@ def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_
         monkeypatch.setattr(module, "SAMPLED", 1 << 9)
     monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=900))
     settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
-    participants = Participants.of(scene, drawable(scene, 400))
-    views, weights = views_and_weights(participants, Sampler(scene), settings)
+    _, weights = views_and_weights(Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings)
     merged(rows_of(scene, tmp_path), 400, 900, tmp_path, settings)
     overview = Scratch(tmp_path / "cells-400-900", {}).known("overview")
     assert torch.allclose(overview["weights"].log(), weights[:: int(overview["step"])].log(), atol=tolerance)
@@ -124,7 +123,6 @@ def test_gaussians_that_cannot_be_drawn_are_dropped_and_counted_once(tmp_path, c
     scene.means[::10] = torch.nan
     (tmp_path / "scene.ply").write_bytes(header_bytes(len(scene), scene.sh_degree) + row_table(scene).tobytes())
     rows = PlyRows.open(tmp_path / "scene.ply")
-    assert rows is not None
     with caplog.at_level("WARNING"):
         found = merge_file(
             rows, lambda n: n // 2, tmp_path / "small.ply", 700, Scratch(tmp_path / "cells", {}), settings=BLIND

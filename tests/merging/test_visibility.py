@@ -9,8 +9,10 @@ import torch
 from making import ball, normal_scene, photographed, splats
 from pointsplat_ns.comparing.sizes import RendersOfSizes, sides_of
 from pointsplat_ns.gaussians import Gaussians
+from pointsplat_ns.looking import traces
 from pointsplat_ns.looking.poses import look_at
 from pointsplat_ns.looking.sampling import Sampler, sample_views
+from pointsplat_ns.looking.settings import LOOKING
 from pointsplat_ns.merging import MERGING, visibility
 from pointsplat_ns.merging.groups import best_size_change, top_of_parabola
 from pointsplat_ns.merging.state import Participants
@@ -83,9 +85,10 @@ def test_weights_are_bounded_whatever_the_scene(dtype, case):
         assert found.tolist() == [1.0] * 400
 
 
-def test_traces_count_where_a_scene_tells_of_photos_and_fog_has_no_views(monkeypatch):
+def test_traces_count_where_sh_tell_of_photos_and_fog_has_no_views(monkeypatch):
     monkeypatch.setattr(visibility, "covered_per_area", lambda scene, rows, *_: torch.full((len(rows),), 0.5))
     monkeypatch.setattr(visibility, "trace_factors", lambda scene, members: torch.full((len(members),), 16.0))
+    monkeypatch.setattr(traces, "LOOKING", replace(LOOKING, min_size_evidence=-1.0))  # without SH, all are sure
     settings = replace(MERGING, sampled_views=2, min_count_rendered=0)
     fog = ball(200).replace(opacities=torch.full((200, 1), -math.inf))
     for scene, weight in ((photographed(), 8.0), (ball(500, 0), 0.5), (fog, 1.0)):

@@ -146,10 +146,6 @@ def change(scene: Path, **values) -> None:
     (scene / TRANSFORMS).write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
 
 
-def frames_of(scene: Path) -> list[dict]:
-    return json.loads((scene / TRANSFORMS).read_text())["frames"]
-
-
 def rewritten(name: str, before: str, after: str) -> Callable[[Path], object]:
     return lambda scene: (scene / name).write_text((scene / name).read_text().replace(before, after))
 
@@ -191,7 +187,8 @@ def test_hidden_photos_of_a_test_leave_a_split_of_the_others(own_scene, scene, c
     same = torch.equal(train.dataparser_transform, parsed(scene).dataparser_transform)
     assert same, "hidden poses count in the frame"
     assert "photos of the test are hidden" in " ".join(capsys.readouterr().out.split())
-    change(own_scene, frames=frames_of(scene), test_frames=None)  # no lists either: every tenth is held out
+    frames = json.loads((scene / TRANSFORMS).read_text())["frames"]
+    change(own_scene, frames=frames, test_frames=None)  # no lists either: every tenth is held out
     assert [len(numbers(parsed(own_scene, split, skip_bad=False))) for split in ("train", "test")] == [6, 1]
 
 

@@ -102,13 +102,9 @@ def _stacked(scene):
     scene[0][:30] = torch.tensor([0.0, 0.0, 3.0], dtype=F64)
 
 
-def _any_length(scene):
-    scene[1] = scene[1] * 10.0 ** torch.linspace(-18, 18, 50, dtype=F64)[:, None]
-
-
 CASES = {
     "zero quaternions": lambda s: s[1][::2].zero_(),
-    "quaternions of any length": _any_length,
+    "quaternions of any length": lambda s: s[1].mul_(10.0 ** torch.linspace(-18, 18, 50, dtype=F64)[:, None]),
     "one flat axis": lambda s: s[2][:, 2].zero_(),
     "lines": lambda s: s[2][:, 1:].zero_(),
     "points": lambda s: s[2].zero_(),
