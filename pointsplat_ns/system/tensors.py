@@ -35,8 +35,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def of_network() -> dict[str, Any]:
-    """Type and place of a network's parameters: float32, on the device that the network's constructor has entered."""
-    return {"dtype": torch.float32, "device": torch.get_default_device()}
+    """Type and place of a network's parameters: float32, on the device that the network's constructor has entered,
+    which ``torch.get_default_device`` does not tell in torch 2.6."""
+    return {"dtype": torch.float32, "device": None}
 
 
 def normal_mode(function: Function) -> Function:
