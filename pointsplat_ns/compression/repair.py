@@ -72,7 +72,7 @@ def repair(
     run = OptimisationRun(budget)
     if network == "shipped":
         network = shipped_feedback_refiner(scene.device)
-    feedback, first_factor = Feedback(scene, len(dense)), initial_rate_factor(psnr)
+    feedback, first_factor = Feedback(scene, len(dense)), budget.rate * initial_rate_factor(psnr)
     work = len(dense), budget, psnr, views.compared().viewmats.tolist()
     file = Unfinished(None if budget.seconds is not None else unfinished, scene, work)
 

@@ -53,6 +53,8 @@ class RepairBudget:
     """Wall-clock time, in place of ``effort``. The result depends on the speed of the machine."""
     growth: float = 1.0
     """Factor on the number of steps, and of sampled views."""
+    rate: float = 1.0
+    """Factor on the learning rates."""
 
     def __post_init__(self) -> None:
         if self.effort not in STEPS:
@@ -67,13 +69,15 @@ class RepairBudget:
 
     def for_count(self, count: int) -> RepairBudget:
         """The budget for a scene of ``count`` Gaussians. Steps grow with the root of the count, to four times as many:
-        a view shows more Gaussians of a large scene, and a smaller share of them.
+        a view shows more Gaussians of a large scene, and a smaller share of them. Of still more Gaussians, each is seen
+        in fewer steps, and moves as far in each, whatever the pixel: so the learning rates fall.
 
         Example:
-            >>> [RepairBudget().for_count(count).growth for count in (5_000, 80_000, 320_000, 5_000_000)]
-            [1.0, 2.0, 4.0, 4.0]
+            >>> budgets = [RepairBudget().for_count(count) for count in (5_000, 80_000, 320_000, 3_200_000)]
+            >>> [(budget.growth, budget.rate) for budget in budgets]
+            [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0), (4.0, 0.1)]
         """
-        return replace(self, growth=min(max(math.sqrt(count / FEW), 1.0), 4.0))
+        return replace(self, growth=min(max(math.sqrt(count / FEW), 1.0), 4.0), rate=min(1.0, 16 * FEW / count))
 
     @property
     def empty(self) -> bool:

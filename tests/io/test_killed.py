@@ -96,8 +96,11 @@ def work(tmp_path_factory) -> Path:
     ps.save(cloud(50, 1, 0), base / "new.ply")
     for what, kinds in KINDS.items():
         for kind in kinds:
-            (base / what / kind / "before").mkdir(parents=True)
-            write_old(kind, base / what / kind / "before")
+            (out := base / what / kind / "before").mkdir(parents=True)
+            if kind == "levels":
+                write_levels(out / "lod", [cloud(30, 3, 0)], {}, [{}])
+            else:
+                ps.save(cloud(30, 3, 0), out / f"a.{kind}")
     alone = {**os.environ, "OMP_NUM_THREADS": "1"}  # what is forked has one thread
     command = [sys.executable, "-c", WORK, str(base)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=alone)
@@ -109,14 +112,6 @@ def shown(folder: Path) -> dict[str, bytes]:
     """The files below a folder, but for what is unfinished, which is hidden."""
     files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
     return {name: path.read_bytes() for name, path in files.items() if not path.name.startswith(".")}
-
-
-def write_old(kind: str, out: Path) -> None:
-    old = cloud(30, 3, 0)
-    if kind == "levels":
-        write_levels(out / "lod", [old], {}, [{}])
-    else:
-        ps.save(old, out / f"a.{kind}")
 
 
 @pytest.mark.parametrize("kind", KINDS["killed"])
