@@ -77,7 +77,9 @@ class RepairBudget:
             >>> [(budget.growth, budget.rate) for budget in budgets]
             [(1.0, 1.0), (2.0, 1.0), (4.0, 1.0), (4.0, 0.1)]
         """
-        return replace(self, growth=min(max(math.sqrt(count / FEW), 1.0), 4.0), rate=min(1.0, 16 * FEW / count))
+        most = 4.0
+        growth = min(max(math.sqrt(count / FEW), 1.0), most)
+        return replace(self, growth=growth, rate=min(1.0, most**2 * FEW / count))
 
     @property
     def empty(self) -> bool:

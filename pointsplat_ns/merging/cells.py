@@ -23,7 +23,7 @@ from pointsplat_ns.geometry.transforms import Cube, bulk_cube, curve_keys, unit_
 from pointsplat_ns.io.files import logger, one_line, read_text, require_space, write_json, write_tensors
 from pointsplat_ns.io.ply import PlyRows
 from pointsplat_ns.io.usable import usable_part
-from pointsplat_ns.merging.state import SAMPLED, drawable
+from pointsplat_ns.merging.state import drawable, sampled_step
 from pointsplat_ns.rasterizer.constants import ALPHA_MIN
 from pointsplat_ns.system.tensors import INDICES
 
@@ -163,7 +163,7 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
     Raises:
         SceneError: if the file cannot be read, or no Gaussian of the sample can be drawn.
     """
-    picked = range(0, rows.count, -(-rows.count // SAMPLED))
+    picked = range(0, rows.count, sampled_step(rows.count))
     some = rows.pick(picked)
     usable = some.usable()
     if not bool(usable.any()):
@@ -202,7 +202,9 @@ def divided(rows: PlyRows, most: int, scratch: Scratch, report: Callable[[float]
         return {"counts": counts, "drawable": clear}
 
     counts = scratch.tensors("counts", write)
-    return Cells(scratch, some[:0], cube, *(tuple(counts[name].tolist()) for name in ("counts", "drawable")))
+    return Cells(
+        scratch, some[:0].map(torch.clone), cube, *(tuple(counts[name].tolist()) for name in ("counts", "drawable"))
+    )
 
 
 def _places(keys: Tensor, numbers: Tensor, count: int) -> Tensor:

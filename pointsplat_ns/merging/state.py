@@ -20,7 +20,12 @@ from pointsplat_ns.system.tensors import DOUBLES
 from pointsplat_ns.system.threads import in_turn
 
 SAMPLED = 1 << 18
-"""About the largest number of Gaussians by which the curve and the borders of cells are found: every so many-th."""
+"""Largest number of Gaussians by which the curve and the borders of cells are found."""
+
+
+def sampled_step(count: int) -> int:
+    """Of ``count`` Gaussians, the curve and the borders of cells are found by every so many-th."""
+    return -(-count // SAMPLED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,7 @@ class Participants:
     @classmethod
     def of(cls, scene: Gaussians, members: Tensor) -> Participants:
         """The participants ``members`` (n,) of a scene, on its device."""
-        some = members[members % -(-len(scene) // SAMPLED) == 0]
+        some = members[members % sampled_step(len(scene)) == 0]
         cube = bulk_cube(scene.means[some if len(some) else members])
         order = curve_keys(unit_cells(scene.means[members], cube)).argsort(stable=True)
         return cls(scene, members[order], *content_size(scene))

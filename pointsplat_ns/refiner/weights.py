@@ -80,8 +80,7 @@ def checked_tensors(file: Any, expected: dict[str, torch.Tensor], path: Path) ->
         if (tensor.get_dtype() in ("F64", "F32", "F16", "BF16")) != expected[name].is_floating_point():
             raise WeightsError(f"{path}: {name} is of type {tensor.get_dtype()}; the file is damaged")
     require_memory(path, path.stat().st_size)
-    with torch.device("cpu"):  # older releases of safetensors would take the global default
-        state = {name: file.get_tensor(name) for name in names}
+    state = {name: file.get_tensor(name) for name in names}
     bad = [name for name, value in state.items() if not value.float().isfinite().all()]
     if bad:
         raise WeightsError(f"{path}: {bad[0]} holds NaN or Inf; expected finite weights; train or download it again")

@@ -130,7 +130,8 @@ def test_views_of_a_large_scene_are_looked_for_in_a_part_of_it(monkeypatch):
     whole = Sampler(scene).content
     monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=600))
     few, given = Sampler(scene, (64, 48)), Sampler(enlarged(scene[::5], 5), (64, 48), stands_for=5)
-    assert len(few.scene) == 600 and torch.equal(few.views(3).viewmats, given.views(3).viewmats)
+    assert len(few.scene) == 600 and len(few.views(3)) == 3
+    assert torch.equal(few.views(3).viewmats, given.views(3).viewmats)
     assert few.content[1] == pytest.approx(whole[1], rel=0.05)
 
 

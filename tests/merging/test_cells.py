@@ -1,6 +1,7 @@
 """Merging cell by cell: the count, the seams, damaged steps, and what is the same as in memory."""
 
 import math
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,7 +21,7 @@ from pointsplat_ns.io.ply import PlyRows, header_bytes, row_table
 from pointsplat_ns.looking import sampling
 from pointsplat_ns.looking.sampling import Sampler, sample_views
 from pointsplat_ns.looking.settings import LOOKING
-from pointsplat_ns.merging import MERGING, MergeSettings, cells, merge, state
+from pointsplat_ns.merging import MERGING, MergeSettings, merge, state
 from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.cells import Scratch, divided
 from pointsplat_ns.merging.state import Participants, drawable
@@ -69,6 +70,7 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
     scene.means[::2] = 0.25  # half of them at one point
     cells = divided(rows_of(scene, tmp_path), 1000, Scratch(tmp_path / "cells", {}), lambda share: None)
     assert sum(cells.counts) == 4000 and max(cells.counts) <= 1010
+    assert len(pickle.dumps(cells)) < 20_000, "processes get no Gaussians"
     read = Gaussians.cat([cells.read(cell) for cell in range(len(cells))])
     order, wanted = (s.features_dc.double().sum(1).argsort() for s in (read, scene))
     assert same_bits(read[order], scene[wanted])
@@ -78,8 +80,7 @@ def test_cells_hold_equally_many_gaussians_even_at_one_position(tmp_path):
 def test_views_and_weights_are_those_of_merging_in_memory(scene, tolerance, tmp_path, monkeypatch):
     """A tolerance for the size of the content, and for the median of traces, both by a sample."""
     scene.opacities[::7] = -9.0  # too faint
-    for module in (state, cells):
-        monkeypatch.setattr(module, "SAMPLED", 1 << 9)
+    monkeypatch.setattr(state, "SAMPLED", 1 << 9)
     monkeypatch.setattr(sampling, "LOOKING", replace(LOOKING, sampled_count=900))
     settings = replace(MERGING, sampled_views=4, min_count_rendered=0, max_count_drawn=600)
     _, weights = views_and_weights(Participants.of(scene, drawable(scene, 400)), Sampler(scene), settings)
@@ -138,12 +139,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from pointsplat_ns.io.ply import PlyRows
-from pointsplat_ns.merging import cells
+from pointsplat_ns.merging import cells, state
 from pointsplat_ns.merging.by_cells import lowest, merge_file
 from pointsplat_ns.merging.settings import MERGING
 from lab.common.timing import start_of_peak, status_bytes
 from pointsplat_ns.system.memory import give_back_freed_memory
-cells.ROWS_AT_ONCE, cells.SAMPLED = 1 << 13, 1 << 12
+cells.ROWS_AT_ONCE, state.SAMPLED = 1 << 13, 1 << 12
 peaks = []
 for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for imports and kernels
     folder = Path(sys.argv[1]) / name
@@ -151,7 +152,7 @@ for name, most in (("few", 1000), ("many", int(sys.argv[2]))):  # the first for 
     start_of_peak()
     peaks.append(status_bytes("VmHWM"))
     rows = PlyRows.open(folder / "scene.ply")
-    blind = replace(MERGING, min_count_rendered=10**9, max_count_drawn=cells.SAMPLED)
+    blind = replace(MERGING, min_count_rendered=10**9, max_count_drawn=state.SAMPLED)
     merge_file(rows, lambda n: n // 10, folder / "small.ply", most, cells.Scratch(folder / "cells", {}), settings=blind)
     peaks.append(status_bytes("VmHWM"))
 print(peaks[3] - peaks[2])
